@@ -212,12 +212,13 @@ def read_page():
 @pytest.fixture(scope="module")  # while one is open, no other loop can run in this thread
 def browser():
     """Chromium, if one is installed."""
-    playwright = pytest.importorskip("playwright.sync_api")
+    from playwright.sync_api import sync_playwright
+
     found = next((path for path in map(shutil.which, BROWSERS) if path), None)
     if found is None:
         pytest.skip(f"none of {', '.join(BROWSERS)} is installed to look at pages with")
     flags = ["--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"]
-    with playwright.sync_playwright() as driver:
+    with sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=found, args=[*flags, "--disable-gpu"])
         yield browser
         browser.close()

@@ -19,6 +19,7 @@ from pkgutil import resolve_name
 from typing import NamedTuple
 from urllib.parse import unquote, urlsplit
 
+import matplotlib
 import pytest
 import typer.testing
 
@@ -144,7 +145,7 @@ def test_every_block_is_run_or_says_why_not(page):
 
 @pytest.mark.slow
 def test_the_notebook_prints_what_it_shows(capsys):
-    pytest.importorskip("matplotlib").use("agg")
+    matplotlib.use("agg")
     names = {}
     for cell in json.loads((ROOT / "examples" / "first-guard.ipynb").read_text("utf-8"))["cells"]:
         if cell["cell_type"] == "code":
@@ -236,7 +237,6 @@ WORDS = [row for row in (DOCS / "glossary.md").read_text().splitlines() if row.s
 
 @pytest.mark.parametrize("word", WORDS, ids=lambda word: word.split("**")[1])
 def test_a_word_has_the_name_in_code_that_the_glossary_gives(word):
-    pytest.importorskip("scipy")
     name = re.search(r"`((?:evofsm|studies)[\w.]+)` \|$", word)[1]
     owner, _, last = name.rpartition(".")
     fields = getattr(resolve_name(owner), "__dataclass_fields__", {})

@@ -105,7 +105,6 @@ def test_workflows_run_on_the_versions_claimed_and_a_linter_has_nothing_to_say()
 
 @pytest.mark.parametrize("home", [None, "https://example.org/evofsm"])
 def test_on_an_index_the_readme_has_no_link_that_leads_nowhere(home, monkeypatch):
-    pytest.importorskip("hatchling")
     monkeypatch.syspath_prepend(ROOT / "tools")
     from readme import as_on_an_index
 

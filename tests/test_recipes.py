@@ -43,7 +43,6 @@ def python(folder, *arguments):
 
 
 def test_a_state_rule(tmp_path):
-    pytest.importorskip("typer")
     write("Add a state rule", tmp_path)
     said = python(tmp_path, "-m", "evofsm", "check", "my_rule:Coarse")
     assert "a_machine_takes_it" in said
@@ -66,8 +65,6 @@ def test_a_column(tmp_path):
 
 
 def test_a_family(tmp_path):
-    pytest.importorskip("typer")
-    pytest.importorskip("scipy")
     write("Add a family, or a world", tmp_path)
     said = python(tmp_path, "-m", "evofsm", "drive", "mine.py", "--episodes", 3)
     assert "mine, 3 training episodes" in said

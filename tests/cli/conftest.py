@@ -8,14 +8,13 @@ import threading
 from contextlib import contextmanager
 from datetime import datetime, timedelta
 
+import polars
 import pytest
 
 
 @pytest.fixture(scope="session")
 def evofsm():
     """Run a command as on the command line."""
-    pytest.importorskip("typer")
-    pytest.importorskip("rich")
     from typer.testing import CliRunner
 
     from evofsm.cli.app import application
@@ -40,7 +39,6 @@ def refused(evofsm):
 @pytest.fixture(scope="session")
 def pump():
     """A log of a row every 5 s or so: now and then vibration grows until the pump trips at 7.1."""
-    polars = pytest.importorskip("polars")
 
     def make(runs=14):
         chance, rows, at = random.Random(1), [], datetime(2025, 3, 10, 6, 0, 11)
@@ -68,7 +66,6 @@ def pump():
 @pytest.fixture
 def shown():
     """Serve a page in a thread, and play on it, as it is set."""
-    pytest.importorskip("websockets")
     from evofsm.cli.watch.server import LivePage, Player
 
     @contextmanager

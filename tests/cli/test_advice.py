@@ -12,9 +12,8 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
+import polars
 import pytest
-
-polars = pytest.importorskip("polars")
 
 
 @pytest.fixture(autouse=True)
@@ -254,7 +253,6 @@ def test_a_command_that_is_advised_makes_a_file_that_is_read(evofsm, make, read)
 
 
 def test_a_bag_of_ros_1_is_converted_and_its_topics_are_told_as_it_is_advised(evofsm):
-    pytest.importorskip("rosbags")
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_typestore
 

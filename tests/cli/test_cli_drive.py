@@ -10,9 +10,8 @@ from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 
+import polars
 import pytest
-
-pytest.importorskip("scipy")
 
 from evofsm.cli.driving import (
     DECISION_TABLE,
@@ -55,7 +54,6 @@ def at_once(folder=None, episodes=6, workers=2, **options):
 
 
 def test_it_learns_saves_and_drives_frozen(evofsm, tmp_path):
-    polars = pytest.importorskip("polars")
     learnt = tmp_path / "learnt"
     first = evofsm("drive", "emergency", "--episodes", 12, "--out", learnt)
     assert first.exit_code == 0, first.stderr
@@ -221,8 +219,6 @@ def is_alive(process):
 @pytest.mark.slow
 @pytest.mark.parametrize("world", ["kinematic", "sumo"])
 def test_it_is_what_driving_in_turn_makes_of_the_same_episodes(tmp_path, world):
-    if world == "sumo":
-        pytest.importorskip("libsumo")
     asked = {"family": load_family("rare"), "seed": 3, "world": world}
     plain = in_turn(learn=False, **asked)
     driven = at_once(tmp_path, **asked)

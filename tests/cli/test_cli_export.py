@@ -4,15 +4,12 @@ from zipfile import is_zipfile
 
 import pytest
 
-pytest.importorskip("scipy")
-
 from evofsm.fsm.machine import EvolvingFSM
 
 
 @pytest.fixture(scope="module")
 def driven(evofsm, tmp_path_factory):
     """A folder that was driven to, and the log of the same episodes."""
-    pytest.importorskip("foxglove")
     out = tmp_path_factory.mktemp("export") / "driven"
     log = out.with_suffix(".mcap")
     command = "drive", "emergency", "--mode", "shadow", "--episodes", 2

@@ -10,7 +10,6 @@ from evofsm.paper import Settings
 
 @pytest.mark.slow
 def test_all_claims_hold_in_sumo_as_the_docs_show_them_and_the_page_is_named(evofsm, tmp_path):
-    pytest.importorskip("libsumo")
     folder = tmp_path / "out"
     run = evofsm("paper", "--out", folder)
     assert run.exit_code == 0, run.stderr

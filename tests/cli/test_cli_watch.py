@@ -5,8 +5,6 @@ from urllib.request import urlopen
 
 import pytest
 
-pytest.importorskip("websockets")
-
 from evofsm.fsm import EvolvingFSM
 
 pytestmark = pytest.mark.usefixtures("compiled")

@@ -8,11 +8,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pytest
-
-pytest.importorskip("typer")
-pytest.importorskip("websockets")
-pytest.importorskip("playwright.sync_api")
-
 from playwright import sync_api as playwright
 from typer.testing import CliRunner
 

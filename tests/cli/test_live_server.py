@@ -9,9 +9,6 @@ from http.client import HTTPConnection
 from urllib.parse import urlsplit
 
 import pytest
-
-pytest.importorskip("websockets")
-
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 

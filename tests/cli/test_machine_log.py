@@ -9,6 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 from zoneinfo import ZoneInfo
 
+import polars
 import pytest
 from tests.cli.test_watching import drive
 
@@ -20,8 +21,6 @@ from evofsm.cli.options import reading_of
 from evofsm.cli.watch.session import watched_log
 from evofsm.cli.watch.words import introduce, tell
 from evofsm.io import LogColumns, episodes_of, read_traces
-
-polars = pytest.importorskip("polars")
 
 VIBRATION, BEARING = "Schwingung, mm/s", "Lagertemperatur °C"
 

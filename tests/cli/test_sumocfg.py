@@ -6,9 +6,6 @@ import re
 import pytest
 from tests.cli.test_watching import drive
 
-pytest.importorskip("typer")
-pytest.importorskip("libsumo")
-
 from evofsm.cli.driving import trace_configuration
 from evofsm.cli.options import reading_of
 from evofsm.cli.watch import _is_log

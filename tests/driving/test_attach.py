@@ -5,6 +5,7 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from types import SimpleNamespace
 
+import libsumo
 import numpy as np
 import pytest
 
@@ -22,8 +23,6 @@ from evofsm.driving.measures import deceleration_to_avoid_collision, time_to_col
 from evofsm.driving.traffic import Role
 from evofsm.fsm import IntervalActions
 from evofsm.guard import Guard
-
-libsumo = pytest.importorskip("libsumo")
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "your-own-sumo"
 NO_GAP = ("--collision.mingap-factor", "0")

@@ -2,17 +2,15 @@ import importlib
 from dataclasses import replace
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
+from tests.guard.test_gym import drive
 
-gymnasium = pytest.importorskip("gymnasium")
-
-from gymnasium.utils.env_checker import check_env  # noqa: E402
-from tests.guard.test_gym import drive  # noqa: E402
-
-from evofsm.driving.env import ID, CarFollowing  # noqa: E402
-from evofsm.driving.family import load_family  # noqa: E402
-from evofsm.driving.scenarios import Behind  # noqa: E402
+from evofsm.driving.env import ID, CarFollowing
+from evofsm.driving.family import load_family
+from evofsm.driving.scenarios import Behind
 
 NAME = f"evofsm.driving.env:{ID}"
 INFO = {"time", "gap", "distance", "failed", "rear_ended", "split", "index"}
@@ -115,7 +113,6 @@ def test_there_is_no_step_without_an_episode_or_an_action_that_is_a_number():
 
 
 def test_in_a_platoon_the_example_prevents_collisions(monkeypatch):
-    pytest.importorskip("pettingzoo")
     monkeypatch.syspath_prepend(Path(__file__).parents[2] / "examples")
     unguarded, guarded = importlib.import_module("platoon").main(["--episodes", "1"])
     assert (unguarded, guarded) == (1, 0)

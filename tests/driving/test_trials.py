@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("scipy")
-
 from evofsm.driving.cars import TOLD, guard_for_cars, guard_for_family, learners_of, name_judge
 from evofsm.driving.family import held_out, load_family
 from evofsm.driving.judge import LatentRisk

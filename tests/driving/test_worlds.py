@@ -2,6 +2,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import libsumo
 import numpy as np
 import pytest
 
@@ -10,8 +11,6 @@ from evofsm.driving.scenarios import Behind, Body, CutIn, Leader, Scenario, Sens
 from evofsm.driving.sumo import SumoWorld
 from evofsm.driving.world import REALISED, KinematicWorld
 from evofsm.paper.runs import CASES, Settings
-
-libsumo = pytest.importorskip("libsumo")
 
 SETTINGS = Settings.load()
 NORMAL = IDM(1.25, 25.0, 2.0, 1.5, 2.0)

@@ -9,16 +9,12 @@ from tests.fuzz import fuzz
 
 from evofsm.io.logs import read_traces
 
-pytest.importorskip("polars")
-
 MEGABYTE = 1 << 20
 LOG = "time,gap,v_follower,v_leader,a_follower\n"
 
 
 @pytest.mark.parametrize("name", fuzz.TARGETS)
 def test_neither_the_corpus_nor_a_little_fuzzing_finds_anything(name, tmp_path):
-    if name in ("osi", "mcap"):
-        pytest.importorskip("betterosi")
     for content in fuzz.seeds(name):
         fuzz.tried(name, content)
     if name != "parquet":  # whose reader prints its panics

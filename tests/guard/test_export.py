@@ -6,8 +6,11 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import fmpy
 import numpy as np
 import pytest
+from fmpy.fmi1 import FMICallException
+from fmpy.validation import validate_fmu
 
 import c99
 from evofsm import Guard
@@ -106,7 +109,7 @@ EVIL = "*/ #error \x1b[2J", "?" + "?/\n*/", "/*\\", "\u202e\u2066\u200f\ufffe\ud
 
 @pytest.mark.parametrize("names", [EVIL[:2], EVIL[2:4], EVIL[3:], ("x", "x"), ("\x1b", "\\u001b")])
 def test_no_name_gets_out_of_its_place(wall, names, tmp_path):
-    guard, fmpy = wall.guard.copy(), pytest.importorskip("fmpy")
+    guard = wall.guard.copy()
     guard.judge.labels = guard.judge.labels._replace(names=names, units=names)
     write_c99(guard, tmp_path)
     subprocess.run(["cc", *c99.FLAGS, "-c", "evofsm.c"], cwd=tmp_path, check=True)
@@ -221,10 +224,6 @@ def test_the_node_for_ros_2_compiles_and_decides(wall, tmp_path):
 
 
 def test_tools_load_an_fmu_and_step_it(wall, monkeypatch, tmp_path, caplog, capsys):
-    import fmpy
-    from fmpy.fmi1 import FMICallException
-    from fmpy.validation import validate_fmu
-
     file = tmp_path / "my wall-2.fmu"
     write_fmu(wall.guard, file)
     assert validate_fmu(str(file)) == []

@@ -10,30 +10,30 @@ from contextlib import nullcontext
 from itertools import product
 from pathlib import Path
 
+import gymnasium
 import numpy as np
+import pettingzoo
 import pytest
+from gymnasium import wrappers
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorWrapper
+from pettingzoo.utils import aec_to_parallel, parallel_to_aec
 
-gymnasium = pytest.importorskip("gymnasium")
-
-from gymnasium import wrappers  # noqa: E402
-from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple  # noqa: E402
-from gymnasium.utils.env_checker import check_env  # noqa: E402
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorWrapper  # noqa: E402
-
-import evofsm.guard  # noqa: E402
-from evofsm.driving import CarFollowing, guard_for_cars  # noqa: E402
-from evofsm.fsm import Labels  # noqa: E402
-from evofsm.guard import (  # noqa: E402
+from evofsm.driving import CarFollowing, guard_for_cars
+from evofsm.fsm import Labels
+from evofsm.guard import (
     AuditLog,
     Fallback,
     Guard,
     Judgement,
     RevisedActions,
+    RevisedAgents,
     RevisedVectorActions,
     Search,
     run_episode,
 )
-from evofsm.guard.api import LearningJudge  # noqa: E402
+from evofsm.guard.api import LearningJudge
 
 pytestmark = pytest.mark.filterwarnings("ignore:nobody says which episodes failed")
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -792,39 +792,34 @@ def test_an_episode_is_decided_by_what_was_learnt_before_it_began():
 # -- PettingZoo --------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def crowd():
+class Crowd(pettingzoo.ParallelEnv):
     """A parallel environment of scripts of different lengths, an agent each."""
-    pettingzoo = pytest.importorskip("pettingzoo")
 
-    class Crowd(pettingzoo.ParallelEnv):
-        metadata = {"name": "crowd"}  # noqa: RUF012
-        render_mode = None
+    metadata = {"name": "crowd", "is_parallelizable": True}  # noqa: RUF012
+    render_mode = None
 
-        def __init__(self, *lengths):
-            self.scripts = {
-                f"a{k}": Script(*[FAR] * (length - 1), NEAR) for k, length in enumerate(lengths)
-            }
-            self.possible_agents = list(self.scripts)
+    def __init__(self, *lengths):
+        self.scripts = {
+            f"a{k}": Script(*[FAR] * (length - 1), NEAR) for k, length in enumerate(lengths)
+        }
+        self.possible_agents = list(self.scripts)
 
-        def observation_space(self, agent):
-            return Script.observation_space
+    def observation_space(self, agent):
+        return Script.observation_space
 
-        def action_space(self, agent):
-            return ONE
+    def action_space(self, agent):
+        return ONE
 
-        def reset(self, seed=None, options=None):
-            self.agents = list(self.scripts)
-            each = {one: script.reset(seed=seed) for one, script in self.scripts.items()}
-            return tuple({one: np.array(got[k]) for one, got in each.items()} for k in range(2))
+    def reset(self, seed=None, options=None):
+        self.agents = list(self.scripts)
+        each = {one: script.reset(seed=seed) for one, script in self.scripts.items()}
+        return tuple({one: np.array(got[k]) for one, got in each.items()} for k in range(2))
 
-        def step(self, actions):
-            each = {one: self.scripts[one].step(action) for one, action in actions.items()}
-            said = tuple({one: got[k] for one, got in each.items()} for k in range(5))
-            self.agents = [one for one in self.agents if not said[2][one]]
-            return ({one: np.array(seen) for one, seen in said[0].items()}, *said[1:])
-
-    return Crowd
+    def step(self, actions):
+        each = {one: self.scripts[one].step(action) for one, action in actions.items()}
+        said = tuple({one: got[k] for one, got in each.items()} for k in range(5))
+        self.agents = [one for one in self.agents if not said[2][one]]
+        return ({one: np.array(seen) for one, seen in said[0].items()}, *said[1:])
 
 
 def drive_agents(env, wanted):
@@ -836,12 +831,12 @@ def drive_agents(env, wanted):
 
 
 @pytest.mark.parametrize("named", [2, 1, 0])  # agents that the environment knows beforehand
-def test_the_guard_learns_each_agents_episode_whole_and_info_says_what_was_done(crowd, named):
-    guard, agents = guard_for(ONE, Spy(above_half)), crowd(2, 4)
+def test_the_guard_learns_each_agents_episode_whole_and_info_says_what_was_done(named):
+    guard, agents = guard_for(ONE, Spy(above_half)), Crowd(2, 4)
     del agents.possible_agents[named:]
     if not named:
         del agents.possible_agents
-    env = evofsm.guard.RevisedAgents(agents, guard, penalty=2.0)
+    env = RevisedAgents(agents, guard, penalty=2.0)
     first, *_, last = drive_agents(env, 2.5)
     size = first[4]["a0"]["reviser/penalty"]
     assert size > 0.5
@@ -859,8 +854,8 @@ def test_the_guard_learns_each_agents_episode_whole_and_info_says_what_was_done(
 
 
 @pytest.mark.parametrize("silent", ["infos", "rewards", "observations", "all"])
-def test_what_an_agent_is_not_told_is_optional(crowd, silent):
-    class Silent(crowd):
+def test_what_an_agent_is_not_told_is_optional(silent):
+    class Silent(Crowd):
         def step(self, actions):
             names = "observations", "rewards", "terminated", "truncated", "infos"
             said = dict(zip(names, super().step(actions), strict=True))
@@ -872,9 +867,7 @@ def test_what_an_agent_is_not_told_is_optional(crowd, silent):
 
     guard = guard_for(ONE)
     steps = []
-    env = evofsm.guard.RevisedAgents(
-        Silent(2, 4), guard, failed=lambda step: steps.append(step) or False
-    )
+    env = RevisedAgents(Silent(2, 4), guard, failed=lambda step: steps.append(step) or False)
     drive_agents(env, 0.0)
     last = None if silent in ("observations", "all") else tuple(NEAR)
     assert [(len(rows), end) for rows, end, _ in guard.judge.episodes] == [(1, last), (3, last)]
@@ -882,8 +875,8 @@ def test_what_an_agent_is_not_told_is_optional(crowd, silent):
     assert sum(math.isnan(step.reward) for step in steps) == 2 * (silent in ("rewards", "all"))
 
 
-def test_whom_anothers_failure_ends_did_not_end_by_itself(crowd):
-    class Together(crowd):
+def test_whom_anothers_failure_ends_did_not_end_by_itself():
+    class Together(Crowd):
         def step(self, actions):
             seen, rewards, over, *others = super().step(actions)
             if any(over.values()):
@@ -892,27 +885,27 @@ def test_whom_anothers_failure_ends_did_not_end_by_itself(crowd):
 
     spy, ended = Spy(), []
     spy.end = lambda z, *, failed, terminated: ended.append((failed, terminated))
-    env = evofsm.guard.RevisedAgents(
+    env = RevisedAgents(
         Together(2, 4), guard_for(ONE, spy), failed=lambda step: step.observation[0] < 5.0
     )
     drive_agents(env, 0.0)
     assert ended == [(True, False), (False, False)]
 
 
-def test_agents_that_observe_differently_are_refused(crowd):
+def test_agents_that_observe_differently_are_refused():
     sizes, observe = iter((1, 2)), lambda z: z[: next(sizes)]
-    env = evofsm.guard.RevisedAgents(crowd(2, 4), guard_for(ONE), observe=observe)
+    env = RevisedAgents(Crowd(2, 4), guard_for(ONE), observe=observe)
     with pytest.raises(ValueError, match=r"different numbers of variables, \{'a0': 1, 'a1': 2\}"):
         env.reset()
 
 
-def test_what_an_agent_meets_after_a_step_without_an_action_is_no_consequence(crowd):
-    class Turns(crowd):
+def test_what_an_agent_meets_after_a_step_without_an_action_is_no_consequence():
+    class Turns(Crowd):
         def step(self, actions):
             return super().step({one: actions.get(one, [0.0]) for one in self.agents})
 
     guard = guard_for(ONE)
-    env = evofsm.guard.RevisedAgents(Turns(6, 6), guard)
+    env = RevisedAgents(Turns(6, 6), guard)
     env.reset()
     for acting in (["a0", "a1"], ["a0"], ["a0", "a1"], ["a0", "a1"], ["a0", "a1"]):
         env.step({agent: np.array([0.0]) for agent in acting})
@@ -920,16 +913,13 @@ def test_what_an_agent_meets_after_a_step_without_an_action_is_no_consequence(cr
     assert told == [(1, False), (5, True), (3, True)]
 
 
-def test_agents_that_take_turns_are_told_of_the_parallel_interface(crowd):
-    from pettingzoo.utils import aec_to_parallel, parallel_to_aec
-
-    crowd.metadata = {"name": "crowd", "is_parallelizable": True}
-    turns = parallel_to_aec(crowd(4))
-    for wrap in (evofsm.guard.RevisedAgents, RevisedActions):
+def test_agents_that_take_turns_are_told_of_the_parallel_interface():
+    turns = parallel_to_aec(Crowd(4))
+    for wrap in (RevisedAgents, RevisedActions):
         with pytest.raises(TypeError, match=r"PettingZoo, as parallel_env\(\).*aec_to_parallel"):
             wrap(turns, guard_for(ONE))
     guard = guard_for(ONE)  # as it was advised, and around again
-    turns = parallel_to_aec(evofsm.guard.RevisedAgents(aec_to_parallel(turns), guard))
+    turns = parallel_to_aec(RevisedAgents(aec_to_parallel(turns), guard))
     turns.reset()
     for _ in turns.agent_iter(9):
         turns.step(None if turns.last()[2] else np.array([0.0]))
@@ -937,10 +927,10 @@ def test_agents_that_take_turns_are_told_of_the_parallel_interface(crowd):
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:pettingzoo")  # of what it has itself
-def test_pettingzoo_finds_nothing_to_complain_of(crowd):
+def test_pettingzoo_finds_nothing_to_complain_of():
     from pettingzoo.test import parallel_api_test
 
-    parallel_api_test(evofsm.guard.RevisedAgents(crowd(9, 30), guard_for(ONE)), num_cycles=60)
+    parallel_api_test(RevisedAgents(Crowd(9, 30), guard_for(ONE)), num_cycles=60)
 
 
 # -- Extras and examples -----------------------------------------------------------------------
@@ -961,14 +951,13 @@ def test_stable_baselines3_trains_in_several_environments_under_one_guard(capsys
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("example", "arguments", "needs"),
+    ("example", "arguments"),
     [
-        ("car_following", ["--episodes", "8", "--train", "4"], "gymnasium"),
-        ("highway", ["--episodes", "3", "--train", "1"], "highway_env"),
+        ("car_following", ["--episodes", "8", "--train", "4"]),
+        ("highway", ["--episodes", "3", "--train", "1"]),
     ],
 )
-def test_in_the_examples_collisions_fall(monkeypatch, capsys, example, arguments, needs):
-    pytest.importorskip(needs)
+def test_in_the_examples_collisions_fall(monkeypatch, capsys, example, arguments):
     monkeypatch.syspath_prepend(EXAMPLES)
     unrevised, revised = importlib.import_module(example).main(arguments)
     assert unrevised.collisions >= len(unrevised.speeds) - 1

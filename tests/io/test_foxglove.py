@@ -11,12 +11,9 @@ from contextlib import suppress
 from types import SimpleNamespace
 
 import pytest
-
-pytest.importorskip("foxglove")
-pytest.importorskip("mcap")
-
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
+from websockets.sync.client import connect
 
 from evofsm.driving import IDM, Leader, Scenario, drive, guard_for_cars
 from evofsm.guard import Guard
@@ -167,7 +164,6 @@ def test_any_system_is_shown_by_its_own_names_and_vectors_are_left_to_the_log(tm
 
 
 def test_whoever_connects_sees_the_decisions_as_they_are_made():
-    connect = pytest.importorskip("websockets.sync.client").connect
     guard = guard_for_cars(low=-4.0, high=2.5)
     with FoxgloveSink(0) as sink:
         guard.audit = sink

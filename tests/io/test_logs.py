@@ -9,6 +9,7 @@ import tracemalloc
 from dataclasses import replace
 
 import numpy as np
+import polars
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -19,8 +20,6 @@ from evofsm.fsm.observations import Category, ObservationEncoder
 from evofsm.io import tables
 from evofsm.io.logs import LogColumns, Noted, Resample, episodes_of, read_traces
 from evofsm.io.tables import CsvTable, Wanted
-
-polars = pytest.importorskip("polars")
 
 HEADER = "run,pair,segment,time,gap,v_follower,v_leader,a_follower"
 SHORT = "pair,time,gap,v_follower,v_leader,a_follower,crash"

@@ -4,14 +4,12 @@ import re
 
 import numpy as np
 import pytest
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
 
 from evofsm.cli.learning import warnings_of
 from evofsm.io.logs import LogColumns, Noted, read_traces
 from evofsm.io.rosbag import Field, Topics
-
-rosbags = pytest.importorskip("rosbags")
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer  # noqa: E402
-from rosbags.typesys import Stores, get_typestore  # noqa: E402
 
 STORE = get_typestore(Stores.LATEST)
 EGO, OTHER = "/ego/odometry", "/other/odometry"

@@ -3,8 +3,12 @@
 import gzip
 import math
 
+import libsumo
 import numpy as np
+import polars
 import pytest
+from mcap.writer import IndexType
+from tests.fuzz.fuzz import osi_mcap, osi_traces
 from tests.io.test_logs import refusal
 
 from evofsm.cli.learning import warnings_of
@@ -12,8 +16,6 @@ from evofsm.cli.options import lengths_given
 from evofsm.fsm.observations import ObservationEncoder
 from evofsm.io import vehicles
 from evofsm.io.logs import LogColumns, Noted, episodes_of, read_traces
-
-polars = pytest.importorskip("polars")
 
 OBJECTS = "id,t,x,y,vx,vy,length,lane"
 
@@ -270,7 +272,7 @@ ROUTES = """<routes>
 @pytest.fixture(scope="module")
 def sumo(tmp_path_factory, sumo_road):
     """Writes FCD with SUMO: where it is, and what b and c did."""
-    libsumo, folder = pytest.importorskip("libsumo"), tmp_path_factory.mktemp("sumo")
+    folder = tmp_path_factory.mktemp("sumo")
     sumo_road(folder, 2000)
     (folder / "routes.xml").write_text(ROUTES)
 
@@ -356,15 +358,6 @@ def test_objects_that_cannot_be_right_are_refused_in_words(tmp_path, rows, said)
 # -- ASAM OSI -------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def osi():
-    """What the fuzzer begins with: traces of two cars and a pedestrian, by betterosi."""
-    pytest.importorskip("betterosi")
-    from tests.fuzz import fuzz
-
-    return fuzz
-
-
 def assert_pair(path):
     (chunk,) = read_traces([str(path)])
     gaps = 46.0 - 0.2 * np.arange(5)
@@ -374,19 +367,18 @@ def assert_pair(path):
     assert chunk.times == pytest.approx(5.0 + 0.1 * np.arange(5))
 
 
-def test_ground_truth_and_sensor_views_are_read_gzipped_or_with_logical_lanes_alone(tmp_path, osi):
-    (truth, view), lanes = osi.osi_traces(), next(osi.osi_traces(logical=True))
+def test_ground_truth_and_sensor_views_are_read_gzipped_or_with_logical_lanes_alone(tmp_path):
+    (truth, view), lanes = osi_traces(), next(osi_traces(logical=True))
     named = {"trace.osi": truth, "view.osi": view, "trace.osi.gz": gzip.compress(truth)}
     for name, content in (named | {"lanes.osi": lanes}).items():
         (tmp_path / name).write_bytes(content)
         assert_pair(tmp_path / name)
 
 
-def test_mcap_is_read_by_its_schema_and_named_where_it_holds_something_else(tmp_path, osi):
-    pytest.importorskip("mcap")
+def test_mcap_is_read_by_its_schema_and_named_where_it_holds_something_else(tmp_path):
     path = tmp_path / "trace.mcap"
     for kind, place in (("GroundTruth", 0), ("SensorView", 1), ("SensorData", 0)):
-        path.write_bytes(osi.osi_mcap(kind, place))
+        path.write_bytes(osi_mcap(kind, place))
         if kind == "SensorData":
             assert "its schemas are Log, SensorData" in refusal(path)
         else:
@@ -401,11 +393,11 @@ LEFT_OPEN = {
 
 
 @pytest.mark.parametrize("how", LEFT_OPEN.values(), ids=LEFT_OPEN.keys())
-def test_what_mcap_leaves_open_may_be_left_out_or_there(tmp_path, osi, how):
-    writing, path = pytest.importorskip("mcap.writer"), tmp_path / "trace.mcap"
+def test_what_mcap_leaves_open_may_be_left_out_or_there(tmp_path, how):
+    path = tmp_path / "trace.mcap"
     if "index_types" in how:
-        how = how | {"index_types": writing.IndexType.NONE}
-    path.write_bytes(whole := osi.osi_mcap(enable_data_crcs=False, **how))
+        how = how | {"index_types": IndexType.NONE}
+    path.write_bytes(whole := osi_mcap(enable_data_crcs=False, **how))
     assert_pair(path)
     unknown = b"\x99" + (3).to_bytes(8, "little") + b"own"
     path.write_bytes(whole[:8] + unknown + whole[8:])
@@ -417,8 +409,8 @@ def test_what_mcap_leaves_open_may_be_left_out_or_there(tmp_path, osi, how):
         assert "it ends within a record" in refusal(path)
 
 
-def test_of_a_trace_that_ends_early_the_beginning_is_read(tmp_path, osi):
-    truth, path, noted = next(osi.osi_traces()), tmp_path / "trace.osi", Noted()
+def test_of_a_trace_that_ends_early_the_beginning_is_read(tmp_path):
+    truth, path, noted = next(osi_traces()), tmp_path / "trace.osi", Noted()
     path.write_bytes(truth[:-3])
     (chunk,) = read_traces([str(path)], noted=noted)
     assert len(chunk.times) == 4
@@ -430,18 +422,18 @@ def test_of_a_trace_that_ends_early_the_beginning_is_read(tmp_path, osi):
     assert "message 2 is not ground truth" in " ".join(warnings_of(noted))
 
 
-def test_osi_that_cannot_be_right_is_refused_in_words(tmp_path, osi):
-    (truth, _), path = osi.osi_traces(), tmp_path / "trace.osi"
-    beside = next(osi.osi_traces(lane=0))
+def test_osi_that_cannot_be_right_is_refused_in_words(tmp_path):
+    (truth, _), path = osi_traces(), tmp_path / "trace.osi"
+    beside = next(osi_traces(lane=0))
     for content, said in (
         (truth[:-3], "ends within message 5"),
         (truth[:2], "ends within message 1"),
         (b"\xff\xff\xff\xff", "no trace of OSI"),
         (b"\2\0\0\0\x0b\0", "is not ground truth"),
-        (next(osi.osi_traces(length=0.0)), "object 2 is 0 m long, at (50, 0) m"),
-        (next(osi.osi_traces(x=math.nan)), "it needs a length and numbers"),
+        (next(osi_traces(length=0.0)), "object 2 is 0 m long, at (50, 0) m"),
+        (next(osi_traces(x=math.nan)), "it needs a length and numbers"),
         (beside, "no vehicle ever follows another one"),
-        (next(osi.osi_traces(lane=0, length=0.0, x=math.nan)), "no vehicle ever follows"),
+        (next(osi_traces(lane=0, length=0.0, x=math.nan)), "no vehicle ever follows"),
         (b"", "no object is on a lane"),
     ):
         path.write_bytes(content)

@@ -1,5 +1,6 @@
 """Good controllers are good, and the study says what a guard does to them."""
 
+import polars
 import pytest
 from studies.good import ALONE, FRESH, FROZEN, GOOD, LEARNING, Driver, Good, driven
 from studies.rivals import Unrevised
@@ -30,5 +31,5 @@ def test_a_guard_that_learnt_of_a_careless_controller_leaves_a_good_one_alone():
     assert [row["way"] for row in rows] == [ALONE, FRESH, FROZEN, LEARNING]
     assert all(row["failed"] == 0 and row["kept"] > 0.95 for row in rows)
     worse = [row | {"failed": 2 * (row["way"] == FROZEN)} for row in rows]
-    page = Good().page({"rows": pytest.importorskip("polars").DataFrame(worse)})
+    page = Good().page({"rows": polars.DataFrame(worse)})
     assert page.lost[0].frame["way"].to_list() == [FROZEN]

@@ -6,8 +6,6 @@ import pytest
 from studies import lib, peers
 from studies.peers import TASKS, WAYS, Job, Peers
 
-pl = pytest.importorskip("polars")
-
 
 def row(task="cartpole", way="alone", seed=0, **what):
     told = WAYS[way].filter != "alone"

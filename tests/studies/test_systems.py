@@ -134,7 +134,6 @@ def test_the_ceiling_does_not_see_what_the_episode_will_draw():
 
 @pytest.mark.parametrize("task", HIGHWAY)
 def test_a_task_of_highway_env_is_drawn_by_its_start_alone_and_seen_as_rows(task):
-    pytest.importorskip("highway_env")
     system = make_system(task, "dqn")
     starts = [Start.held_out(3, k) for k in (1, 1, *range(2, 10))]
     seen = [system.reset(options={"start": start})[0] for start in starts]

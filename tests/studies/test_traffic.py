@@ -5,8 +5,6 @@ from studies import traffic
 from studies.lib import frame_of
 from studies.traffic import ALONE, OURS, Traffic, beside_alone, simulate
 
-pytest.importorskip("libsumo")
-
 
 @pytest.mark.slow
 def test_late_drivers_are_simulated_beside_themselves_without_guards():

@@ -13,6 +13,7 @@ import unittest.mock
 from contextlib import contextmanager
 
 import pytest
+import zenoh
 
 from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.monitor.messages import LONGEST
@@ -211,7 +212,6 @@ def until(holds):
 @pytest.fixture
 def alone(tmp_path, monkeypatch):
     """Zenoh on this computer alone; returns the configuration of a peer."""
-    zenoh = pytest.importorskip("zenoh")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         place = f"tcp/127.0.0.1:{free.getsockname()[1]}"
@@ -224,8 +224,6 @@ def alone(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_zenoh_carries_the_same_and_refuses_a_key_that_is_none(alone, plain):
-    import zenoh
-
     with pytest.raises(ValueError, match="--zenoh"):
         ZenohTransport("car//monitor")
     answers: queue.Queue = queue.Queue()

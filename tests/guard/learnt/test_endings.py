@@ -1,14 +1,13 @@
 """Endings that are no failure end a replay: who may land, lands."""
 
+import gymnasium
 import numpy as np
 import pytest
 
-gymnasium = pytest.importorskip("gymnasium")
-
-from evofsm import Guard  # noqa: E402
-from evofsm.guard import LearntRisk, RevisedActions  # noqa: E402
-from evofsm.guard.learnt.failure import SAYS, are_sides, distances  # noqa: E402
-from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS  # noqa: E402
+from evofsm import Guard
+from evofsm.guard import LearntRisk, RevisedActions
+from evofsm.guard.learnt.failure import SAYS, are_sides, distances
+from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS
 
 
 class Descent(gymnasium.Env):
