@@ -106,9 +106,11 @@ def reloaded():
 
 @pytest.fixture(scope="session")
 def forge():
-    """Change a file so that its checksum is right: settings and the first numbers of arrays by
-    name, or whatever a function does to what its header tells, its entries and its numbers.
+    """Change a file so that its checksum is right: settings and arrays by name, to a value (of an
+    array its first numbers) or by a function of what it was, or whatever a function does to what
+    its header tells, its entries and its numbers.
     """
+    kinds = {"F64": "<f8", "I64": "<i8", "U8": "|u1", "BOOL": "|b1"}
 
     def change(path, changes):
         data = path.read_bytes()
@@ -120,12 +122,21 @@ def forge():
             changes = {}
         for name, value in changes.items():
             if name not in entries:
-                told["settings"][name] = value
+                settings = told["settings"]
+                settings[name] = value(settings[name]) if callable(value) else value
                 continue
-            kinds = {"F64": "<f8", "I64": "<i8", "U8": "|u1", "BOOL": "|b1"}
-            begin, _ = entries[name]["data_offsets"]
-            one = np.array(value, kinds[entries[name]["dtype"]]).tobytes()
-            numbers[begin : begin + len(one)] = one
+            entry, place = entries[name], 0
+            part = slice(*entry["data_offsets"])
+            array = np.frombuffer(numbers[part], kinds[entry["dtype"]]).reshape(entry["shape"])
+            if callable(value):
+                array = value(array).astype(array.dtype)
+            else:
+                array.flat[: np.size(value)] = value
+            numbers[part] = array.tobytes()
+            entry |= {"shape": array.shape, "data_offsets": [part.start, part.start + array.nbytes]}
+            for one in entries.values():  # those behind it begin elsewhere
+                begin, end = one["data_offsets"]
+                one["data_offsets"] = [place, place := place + end - begin]
         metadata = {"sha256": "0" * 64, "evofsm": json.dumps(told)}
         header = json.dumps({"__metadata__": metadata, **entries}).encode()
         digest = hashlib.sha256(header + numbers).hexdigest().encode()
