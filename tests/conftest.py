@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import one_machine
-from evofsm.fsm.machine import EvolvingFSM
+from evofsm import EvolvingFSM
 
 # The same examples in every run, so that a red build is red again on the next machine.
 hypothesis.settings.register_profile("evofsm", deadline=None, derandomize=True, database=None)

@@ -24,7 +24,7 @@ import pytest
 import typer.testing
 
 import evofsm
-from evofsm.cli.app import application
+from evofsm.cli import application
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -202,9 +202,7 @@ def test_the_wheel_holds_every_source_file_and_nothing_else(wheel):
 def test_the_wheel_learns_saves_and_forecasts_with_its_core_dependencies_alone(fresh, tmp_path):
     program = """
 import sys
-from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.model import FSMModel
-from evofsm.fsm.actions import IntervalActions
+from evofsm import EvolvingFSM, FSMModel, IntervalActions
 
 actions = IntervalActions(-1.0, 1.0, 0.5)
 machine = EvolvingFSM(actions.n_actions, radius=0.5)

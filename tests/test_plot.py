@@ -13,9 +13,9 @@ from matplotlib.patches import Ellipse, FancyArrowPatch
 from studies.judges import run
 from studies.systems import Start, make_system
 
-from evofsm import EvolvingFSM, IntervalActions, Novelty, plot
+from evofsm import EvolvingFSM, Guard, IntervalActions, Novelty, plot
 from evofsm.driving import guard_for_family, load_family
-from evofsm.guard import Foresight, Guard, LearntRisk
+from evofsm.guard import Foresight, LearntRisk
 
 OF_A_MODEL = (plot.states, plot.graph)
 

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import polars
 import pytest
 
+from evofsm import Guard
 from evofsm.cli.driving import (
     DECISION_TABLE,
     Results,
@@ -22,7 +23,6 @@ from evofsm.cli.driving import (
     make_guard,
 )
 from evofsm.driving import load_family
-from evofsm.guard import Guard
 from evofsm.guard.audit_log import digests_of
 
 EMERGENCY = load_family("emergency")

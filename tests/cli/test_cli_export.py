@@ -4,7 +4,7 @@ from zipfile import is_zipfile
 
 import pytest
 
-from evofsm.fsm.machine import EvolvingFSM
+from evofsm import EvolvingFSM
 
 
 @pytest.fixture(scope="module")

@@ -8,11 +8,9 @@ import re
 import pytest
 from tests.test_recipes import write
 
+from evofsm import FSMModel, Guard, Novelty, Paper
 from evofsm.cli.options import read_with, reading_of
 from evofsm.cli.watch.session import watched_log
-from evofsm.fsm.model import FSMModel
-from evofsm.fsm.rules import Novelty, Paper
-from evofsm.guard import Guard
 from evofsm.io import tables
 
 

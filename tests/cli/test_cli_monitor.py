@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from evofsm.cli.app import application
+from evofsm.cli import application
 from evofsm.cli.monitor.decider import Decider
 from evofsm.driving.cars import guard_of_monitor
 from evofsm.guard import audit

@@ -5,7 +5,7 @@ from urllib.request import urlopen
 
 import pytest
 
-from evofsm.fsm import EvolvingFSM
+from evofsm import EvolvingFSM
 
 pytestmark = pytest.mark.usefixtures("compiled")
 

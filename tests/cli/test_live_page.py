@@ -12,15 +12,9 @@ from playwright import sync_api as playwright
 from typer.testing import CliRunner
 
 from evofsm import Guard
-from evofsm.cli.app import application
+from evofsm.cli import application
 from evofsm.cli.options import reading_of
-from evofsm.cli.watch.session import (
-    OnRoads,
-    Session,
-    learn_first,
-    read_simulated,
-    watched_log,
-)
+from evofsm.cli.watch.session import OnRoads, Session, learn_first, read_simulated, watched_log
 from evofsm.driving import KinematicWorld, load_family
 
 PAPER = load_family("paper")

@@ -9,6 +9,7 @@ import libsumo
 import numpy as np
 import pytest
 
+from evofsm import Guard, IntervalActions
 from evofsm.driving import (
     EnvelopeReviser,
     LatentRisk,
@@ -21,8 +22,6 @@ from evofsm.driving import (
 from evofsm.driving.attached import choose
 from evofsm.driving.measures import deceleration_to_avoid_collision, time_to_collision
 from evofsm.driving.traffic import Role
-from evofsm.fsm import IntervalActions
-from evofsm.guard import Guard
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "your-own-sumo"
 NO_GAP = ("--collision.mingap-factor", "0")

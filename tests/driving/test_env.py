@@ -8,8 +8,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from tests.guard.test_gym import drive
 
-from evofsm.driving.env import ID, CarFollowing
-from evofsm.driving.family import load_family
+from evofsm.driving import CarFollowing, load_family
+from evofsm.driving.env import ID
 from evofsm.driving.scenarios import Behind
 
 NAME = f"evofsm.driving.env:{ID}"

@@ -9,11 +9,10 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from evofsm.driving.family import FAMILIES, SWITCHES, load_family
+from evofsm.driving import FAMILIES, KinematicWorld, drive, load_family, unrevised_guard
+from evofsm.driving.family import SWITCHES
 from evofsm.driving.measures import is_dead_end
-from evofsm.driving.trials import drive, unrevised_guard
-from evofsm.driving.world import KinematicWorld
-from evofsm.paper.runs import Settings
+from evofsm.paper import Settings
 
 LOADED = {name: load_family(name) for name in FAMILIES}
 BEFORE_AND_AFTER = [

@@ -6,11 +6,11 @@ import libsumo
 import numpy as np
 import pytest
 
-from evofsm.driving.drivers import IDM, ChangingIDM
-from evofsm.driving.scenarios import Behind, Body, CutIn, Leader, Scenario, Sensors
-from evofsm.driving.sumo import SumoWorld
-from evofsm.driving.world import REALISED, KinematicWorld
-from evofsm.paper.runs import CASES, Settings
+from evofsm.driving import IDM, Body, ChangingIDM, KinematicWorld, Leader, Scenario, SumoWorld
+from evofsm.driving.scenarios import Behind, CutIn, Sensors
+from evofsm.driving.world import REALISED
+from evofsm.paper import Settings
+from evofsm.paper.runs import CASES
 
 SETTINGS = Settings.load()
 NORMAL = IDM(1.25, 25.0, 2.0, 1.5, 2.0)

@@ -3,7 +3,7 @@ from itertools import pairwise
 
 import pytest
 
-from evofsm.fsm.actions import IntervalActions
+from evofsm import IntervalActions
 
 PAPER = {"low": -2.5, "high": 2.5, "width": 0.3}
 # Edges as a person writes them, not as floating point computes them.

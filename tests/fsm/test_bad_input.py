@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from evofsm.fsm.machine import EvolvingFSM
+from evofsm import EvolvingFSM
 from one_machine import saved
 
 NAN, INF = float("nan"), float("inf")

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evofsm.fsm.divergence import jensen_shannon
+from evofsm import jensen_shannon
 
 
 @st.composite

@@ -9,10 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from evofsm import EvolvingFSM, FSMModel, Novelty, register_rule
 from evofsm.fsm.explanation import Tally
-from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.model import FSMModel
-from evofsm.fsm.rules import Novelty, register_rule
 
 COUNTS = ("episodes", "failed_soon", "tried", "failed_after")
 

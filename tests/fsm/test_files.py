@@ -4,10 +4,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.model import FSMModel
-from evofsm.fsm.rules import Novelty, Paper
+from evofsm import EvolvingFSM, FSMModel, IntervalActions, Novelty, Paper
 
 
 def full_model(grown):

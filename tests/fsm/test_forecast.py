@@ -3,10 +3,7 @@
 import numpy as np
 import pytest
 
-from evofsm.fsm.divergence import jensen_shannon
-from evofsm.fsm.forecast import Forecasts
-from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.rules import Novelty
+from evofsm import EvolvingFSM, Forecasts, Novelty, jensen_shannon
 
 RULE = Novelty(radius=0.9, spread=0.5)
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evofsm.fsm.machine import EvolvingFSM
+from evofsm import EvolvingFSM
 
 
 @pytest.fixture(scope="module", params=["paper_four_runs", "random_walk"])

@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.rules import Novelty, Paper
-from evofsm.fsm.step import Event
+from evofsm import Event, EvolvingFSM, Novelty, Paper
 
 
 def sharp(**settings):

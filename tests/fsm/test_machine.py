@@ -4,8 +4,7 @@ import sys
 import numpy as np
 import pytest
 
-from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.rules import Novelty
+from evofsm import EvolvingFSM, Novelty
 
 # -- Failure -----------------------------------------------------------------------------------
 
@@ -72,7 +71,7 @@ def test_a_width_beyond_all_bounds_leaves_no_belief_to_states_that_are_not_there
 def test_threads_may_begin_at_once():
     program = """
 from concurrent.futures import ThreadPoolExecutor
-from evofsm.fsm.machine import EvolvingFSM
+from evofsm import EvolvingFSM
 with ThreadPoolExecutor(4) as threads:
     list(threads.map(lambda _: EvolvingFSM(1).learn_one([0.0], 0), range(4)))
 """

@@ -4,11 +4,8 @@ import pickle
 import numpy as np
 import pytest
 
-from evofsm.fsm.actions import IntervalActions
+from evofsm import EvolvingFSM, FSMModel, IntervalActions, Novelty
 from evofsm.fsm.arrays import OF_ACTIONS, SUMS
-from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.model import FSMModel
-from evofsm.fsm.rules import Novelty
 
 ACTIONS = IntervalActions(low=-1.0, high=1.0, width=1.0)
 

@@ -3,9 +3,7 @@ import re
 
 import pytest
 
-from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.observations import Category, ObservationEncoder
-from evofsm.fsm.step import Event
+from evofsm import Category, Event, EvolvingFSM, ObservationEncoder
 
 LIGHT = Category("light", ("red", "amber", "green"), distance=10.0)
 

@@ -5,9 +5,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.rules import Novelty
-from evofsm.fsm.step import Event
+from evofsm import Event, EvolvingFSM, Novelty
 from one_machine import saved
 
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evofsm.fsm.machine import EvolvingFSM
+from evofsm import EvolvingFSM
 from reference import NumpyFSM
 
 

@@ -10,9 +10,8 @@ import pytest
 from river import checks, datasets, evaluate, metrics, stream
 from river.checks import common
 
-from evofsm.fsm.machine import EvolvingFSM
+from evofsm import EvolvingFSM, Novelty
 from evofsm.fsm.river import RiverClusterer
-from evofsm.fsm.rules import Novelty
 
 # River's own list runs these only on models it has a data set for, and has none for clusterers.
 _ON_DATA = [

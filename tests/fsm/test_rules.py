@@ -9,9 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.rules import Novelty, Paper, describe_rule, register_rule
-from evofsm.fsm.step import Event
+from evofsm import Event, EvolvingFSM, Novelty, Paper, register_rule
+from evofsm.fsm.rules import describe_rule
 from evofsm.guard.check import check_results
 
 # -- All rules -------------------------------------------------------------------------------------

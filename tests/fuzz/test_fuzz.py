@@ -7,7 +7,7 @@ import tracemalloc
 import pytest
 from tests.fuzz import fuzz
 
-from evofsm.io.logs import read_traces
+from evofsm.io import read_traces
 
 MEGABYTE = 1 << 20
 LOG = "time,gap,v_follower,v_leader,a_follower\n"

@@ -15,9 +15,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import one_machine
-from evofsm import IntervalActions
+from evofsm import Guard, IntervalActions
 from evofsm.driving import EnvelopeReviser, LatentRisk, Unrevised, guard_for_cars, measures
-from evofsm.guard import ActionReviser, AuditLog, Guard, Head, Mode, audit, audit_log
+from evofsm.guard import ActionReviser, AuditLog, Head, Mode, audit, audit_log
 from evofsm.guard.audit_log import NOTHING, Chain, canonical, seal, unseal
 
 ACTIONS = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")

@@ -7,10 +7,9 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
+from evofsm import IntervalActions, Novelty, Paper
 from evofsm.driving import IDM, EnvelopeReviser, LatentRisk, Unrevised
 from evofsm.driving.measures import ModifiedTimeToCollision
-from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.rules import Novelty, Paper
 from evofsm.guard import ActionReviser, Mode, Proposal
 from evofsm.guard.check import check_results, kind_of
 

@@ -20,20 +20,19 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorWrapper
 from pettingzoo.utils import aec_to_parallel, parallel_to_aec
 
+from evofsm import Guard, Labels
 from evofsm.driving import CarFollowing, guard_for_cars
-from evofsm.fsm import Labels
 from evofsm.guard import (
     AuditLog,
     Fallback,
-    Guard,
     Judgement,
+    LearningJudge,
     RevisedActions,
     RevisedAgents,
     RevisedVectorActions,
     Search,
     run_episode,
 )
-from evofsm.guard.api import LearningJudge
 
 pytestmark = pytest.mark.filterwarnings("ignore:nobody says which episodes failed")
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from evofsm import Labels
-from evofsm.guard import AuditLog, Guard, LearntRisk, Mode, audit
-from evofsm.guard.api import Fallback, Judgement, ObservingJudge, Search
+from evofsm import Guard, Labels
+from evofsm.guard import AuditLog, Fallback, Judgement, LearntRisk, Mode, Search, audit
+from evofsm.guard.api import ObservingJudge
 from evofsm.guard.export import write_c99
 from evofsm.guard.harm import Harm, Outcome
 from evofsm.guard.learnt.judge import _unjudged

@@ -7,11 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evofsm.driving.judge import LatentRisk
-from evofsm.fsm.actions import IntervalActions
+from evofsm import IntervalActions
+from evofsm.driving import LatentRisk
+from evofsm.guard import ActionReviser, Judgement, Mode, Proposal, Situation
 from evofsm.guard.actions import nearest_bounds
-from evofsm.guard.api import Judgement, Proposal, Situation
-from evofsm.guard.reviser import ActionReviser, Mode
 
 LOW, HIGH, TOLERANCE = -2.5, 2.5, 0.02
 ACTIONS = IntervalActions(low=LOW, high=HIGH, width=0.3)

@@ -5,9 +5,8 @@ import re
 import numpy as np
 import pytest
 
-from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.machine import EvolvingFSM
-from evofsm.io.graphs import to_dot, to_prism
+from evofsm import EvolvingFSM, IntervalActions
+from evofsm.io import to_dot, to_prism
 
 ODD = 'v "\\#1;<b>&`x`{|}'
 

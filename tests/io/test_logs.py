@@ -14,11 +14,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from evofsm import Category, ObservationEncoder
 from evofsm.cli.learning import warnings_of
 from evofsm.cli.options import reading_of
-from evofsm.fsm.observations import Category, ObservationEncoder
-from evofsm.io import tables
-from evofsm.io.logs import LogColumns, Noted, Resample, episodes_of, read_traces
+from evofsm.io import LogColumns, episodes_of, read_traces, tables
+from evofsm.io.logs import Noted, Resample
 from evofsm.io.tables import CsvTable, Wanted
 
 HEADER = "run,pair,segment,time,gap,v_follower,v_leader,a_follower"

@@ -11,11 +11,11 @@ from mcap.writer import IndexType
 from tests.fuzz.fuzz import osi_mcap, osi_traces
 from tests.io.test_logs import refusal
 
+from evofsm import ObservationEncoder
 from evofsm.cli.learning import warnings_of
 from evofsm.cli.options import lengths_given
-from evofsm.fsm.observations import ObservationEncoder
-from evofsm.io import vehicles
-from evofsm.io.logs import LogColumns, Noted, episodes_of, read_traces
+from evofsm.io import LogColumns, episodes_of, read_traces, vehicles
+from evofsm.io.logs import Noted
 
 OBJECTS = "id,t,x,y,vx,vy,length,lane"
 

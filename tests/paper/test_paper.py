@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from evofsm import FSMModel
 from evofsm.driving import KinematicWorld
-from evofsm.fsm import FSMModel
-from evofsm.paper.claims import check_claims
+from evofsm.paper import Settings, check_claims, run_paper
 from evofsm.paper.reproduction import divergences, page_of, write
-from evofsm.paper.runs import Settings, run_paper
 
 PAGE = Path(__file__).parents[2] / "docs" / "paper.md"
 

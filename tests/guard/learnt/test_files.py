@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from evofsm import Guard, store
+from evofsm.guard import LearntRisk
 from evofsm.guard.guard import KIND as GUARD
-from evofsm.guard.learnt.judge import LearntRisk
 
 
 def without_first(*axes):

@@ -9,12 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evofsm.guard import Guard, Mode
+from evofsm import Guard
+from evofsm.guard import AuditLog, LearntRisk, Mode, Proposal, Situation, audit
 from evofsm.guard.actions import same_action
-from evofsm.guard.api import Proposal, Situation
-from evofsm.guard.audit_log import AuditLog, audit
 from evofsm.guard.learnt import judge as judging
-from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.learnt.rollout import action_of, search
 
 
