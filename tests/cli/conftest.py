@@ -10,15 +10,15 @@ from datetime import datetime, timedelta
 
 import polars
 import pytest
+from typer.testing import CliRunner
+
+from evofsm.cli import application
+from evofsm.cli.watch.server import LivePage, Player
 
 
 @pytest.fixture(scope="session")
 def evofsm():
     """Run a command as on the command line."""
-    from typer.testing import CliRunner
-
-    from evofsm.cli.app import application
-
     return lambda *words: CliRunner().invoke(application(), [*map(str, words)])
 
 
@@ -66,7 +66,6 @@ def pump():
 @pytest.fixture
 def shown():
     """Serve a page in a thread, and play on it, as it is set."""
-    from evofsm.cli.watch.server import LivePage, Player
 
     @contextmanager
     def show(opened, **settings):

@@ -14,6 +14,8 @@ from pathlib import Path
 import numpy as np
 import polars
 import pytest
+from rosbags.rosbag1 import Writer
+from rosbags.typesys import Stores, get_typestore
 
 
 @pytest.fixture(autouse=True)
@@ -253,9 +255,6 @@ def test_a_command_that_is_advised_makes_a_file_that_is_read(evofsm, make, read)
 
 
 def test_a_bag_of_ros_1_is_converted_and_its_topics_are_told_as_it_is_advised(evofsm):
-    from rosbags.rosbag1 import Writer
-    from rosbags.typesys import Stores, get_typestore
-
     store, kind = get_typestore(Stores.ROS1_NOETIC), "std_msgs/msg/Float64"
     with Writer("drive.bag") as bag:
         topic = bag.add_connection("/v", kind, typestore=store)

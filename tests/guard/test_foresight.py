@@ -65,7 +65,7 @@ def test_where_one_limit_depends_on_another_it_foresees_more_than_thresholds(sur
     assert re.search(r"0\.\d+ flow above 0\.\d+", surge.told_by_experience)
 
 
-def test_it_finds_which_two_of_many_variables_limit_each_other(surge):
+def test_it_finds_which_two_of_many_variables_limit_each_other():
     rng, (runs, failed) = np.random.default_rng(5), log_of(surging, 0, 40)
     wide = [np.column_stack([rng.normal(size=(len(z), 7)).cumsum(0), z]) for z in runs]
     names = *map(str, range(7)), *NAMES
