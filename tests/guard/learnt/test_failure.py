@@ -234,9 +234,11 @@ def test_what_refused_for_long_without_a_failure_is_tried_by_its_smallest_rival(
         fly(lambda z: rng.uniform(0.0, 0.9))
     words = "tried while it learns, .*: it only fails if it ends|ends by itself where"
     assert re.search(words, str(guard))
+    assert "ending" not in str(guard)  # that it ends there is supposed, of failures
     assert sum(fly(softly) for _ in range(9)) >= 7
     assert (guard.judge.state.forms[:, SAYS] == ENDS).any()  # it is known now
     guard.freeze()
+    assert "tried while it learns" not in str(guard)
     assert sum(fly(softly) for _ in range(9)) == 9
 
 

@@ -600,7 +600,8 @@ class LearntRisk(ObservingJudge, SearchingJudge):
     @property
     def told_by_experience(self) -> str:
         """What was learnt so far, in words."""
-        text = words.experience(self.state, self.remembered, self.called, self._no_threshold)
+        here = self.remembered, self.called, self._no_threshold
+        text = words.experience(self.state, *here, learning=self.learning)
         text += f"; {self.uncovered}" if self.uncovered else ""
         return text + words.harm(self.harm, learning=self.learning)
 

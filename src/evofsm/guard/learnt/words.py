@@ -22,6 +22,7 @@ were they 1.3 times as hard'
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -147,7 +148,9 @@ def no_threshold(n_failed: int, n_survived: int, *, is_given: bool) -> str:
     return f"{failures} seen, but beyond no value that was survived, so nothing is refused"
 
 
-def experience(state: State, remembered: Remembered, names: Sequence[str], nothing: str) -> str:
+def experience(
+    state: State, remembered: Remembered, names: Sequence[str], nothing: str, *, learning: bool
+) -> str:
     """What was learnt so far; what is said of failure where that is not known is ``nothing``."""
     there, ends, fatal_places = _where(state.forms, names)
     latest = {int(j): int(since) + 1 for j, since, _ in state.drifts}
@@ -163,10 +166,12 @@ def experience(state: State, remembered: Remembered, names: Sequence[str], nothi
     if state.differs:
         more += f"; failed= says otherwise in {state.differs:.1%} of the states around, where this "
         more += "decides"
-    if state.is_doubted:
-        fails, ends, _ = _where(state.rivals, names)
-        more += "; tried while it learns, as much was refused without a failure: it only "
-        more += f"fails {fails}" + (f", and ends by itself {' or '.join(ends)}" if ends else "")
+    if state.is_doubted and (learning or state.is_settled):  # frozen, others count for nothing
+        fails, exits, _ = _where(state.rivals, names)
+        # What only rivals take for endings were failures.
+        exits = [t if t in ends else re.sub(r"ending(s?\))$", r"failure\1", t) for t in exits]
+        more += f"; {'tried while it learns, ' * learning}as much was refused without a failure: it"
+        more += f" only fails {fails}{', and ends by itself ' * bool(exits)}{' or '.join(exits)}"
     if len(state.dropped):
         until, *_ = _where(state.dropped, names)
         more += f"; frozen it refuses, too, {until}, as what took its place is new"
