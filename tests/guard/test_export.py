@@ -15,7 +15,7 @@ from fmpy.validation import validate_fmu
 import c99
 from evofsm import Guard
 from evofsm.driving import LatentRisk, guard_for_cars
-from evofsm.guard import Mode
+from evofsm.guard import Fallback, Mode
 from evofsm.guard.export import write_c99, write_fmu
 
 PAGE = Path(__file__).parents[2] / "docs" / "on-your-target.md"
@@ -83,9 +83,15 @@ def test_what_would_compute_otherwise_does_not_compile(wall, flags, tmp_path):
     assert "evofsm needs" in built.stderr.replace("_", " ")
 
 
-@pytest.mark.parametrize("flags", [flags for flags in INEXACT[:6] if flags != "-Ofast"])
+ROUND = "#include <fenv.h>\n__attribute__((constructor)) void turn(void) { fesetround(FE_%s); }"
+
+
+@pytest.mark.parametrize("flags", [*INEXACT[1:6], "DOWNWARD", "UPWARD", "TOWARDZERO"])
 def test_where_no_macro_tells_of_that_it_decides_nothing(wall, flags, tmp_path):
     untold = [f"-U__{name}__" for name in UNTOLD]
+    if flags.isalpha():
+        (tmp_path / "round.c").write_text(ROUND % flags)
+        flags = str(tmp_path / "round.c")
     program = c99.build(wall.guard, tmp_path, "-O2", *flags.split(), *untold, "-w")
     told = subprocess.run([program], input=bytes(8 * 5 * 3), capture_output=True, check=True)
     assert np.frombuffer(told.stdout).reshape(3, -1)[:, 0].tolist() == [2.0] * 3
@@ -102,6 +108,22 @@ def test_a_prefix_that_is_no_name_is_refused(wall, prefix, tmp_path):
     with pytest.raises(ValueError, match="begins no name in C"):
         write_c99(wall.guard, tmp_path / "out", prefix)
     assert not (tmp_path / "out").exists()
+
+
+def test_files_of_two_exports_do_not_compile_together(wall, full_at, tmp_path):
+    other, guard = tmp_path / "other", wall.guard.copy()
+    write_c99(guard, other)
+    guard.reviser.tolerance *= 2.0
+    write_c99(guard, tmp_path)
+    was = {file: file.read_bytes() for file in other.iterdir()}
+    with full_at(len(was[other / "evofsm.h"]) + 5), pytest.raises(OSError, match="too large"):
+        write_c99(guard, other)  # the disk is full after the first of them
+    assert was == {file: file.read_bytes() for file in other.iterdir()}
+    shutil.copy(other / "evofsm.h", tmp_path)
+    for source in ("-xc", "evofsm.c"), ("-xc++", "evofsm.hpp"):
+        command = ["cc", "-fsyntax-only", *source]
+        built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+        assert f"{source[1]} and evofsm.h are of different exports" in built.stderr
 
 
 EVIL = "*/ #error \x1b[2J", "?" + "?/\n*/", "/*\\", "\u202e\u2066\u200f\ufffe\ud800", "a<&\"'\t"
@@ -224,11 +246,17 @@ def test_the_node_for_ros_2_compiles_and_decides(wall, tmp_path):
 
 
 def test_tools_load_an_fmu_and_step_it(wall, monkeypatch, tmp_path, caplog, capsys):
-    file = tmp_path / "my wall-2.fmu"
-    write_fmu(wall.guard, file)
+    file, guard = tmp_path / "my wall-2.fmu", wall.guard.copy()
+    guard.reviser.fallback = Fallback(0.25, "a quarter")
+    write_fmu(guard, file)
     assert validate_fmu(str(file)) == []
     told, place = fmpy.read_model_description(file), fmpy.extract(file, tmp_path / "unit")
     unit = fmpy.instantiate_fmu(place, told, "CoSimulation")
+    assert (
+        unit.getReal([2, 3])
+        == [0.25, 0.25]
+        == [float(told.modelVariables[k].start) for k in (2, 3)]
+    )
     unit.setReal([0, 1, 2], [0.9, 0.1, 1.0])
     for _ in range(3):  # it decides at the first of them
         unit.doStep(0.0, wall.guard.interval / 3)

@@ -17,7 +17,7 @@ import sys
 import tempfile
 import zipfile
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
@@ -86,10 +86,12 @@ def write_c99(guard: Guard, folder: Path, prefix: str = "evofsm") -> None:
         )
     texts = _texts(guard)
     folder.mkdir(parents=True, exist_ok=True)
-    for suffix in ("h", "hpp", "c"):
-        text = texts[f"evofsm.{suffix}"].replace("EVOFSM", prefix.upper())
-        with store.replacing(folder / f"{prefix}.{suffix}") as place:
+    with ExitStack() as files:  # all are written before one takes its place
+        for suffix in ("h", "hpp", "c"):
+            text = texts[f"evofsm.{suffix}"].replace("EVOFSM", prefix.upper())
+            place = files.enter_context(store.replacing(folder / f"{prefix}.{suffix}"))
             place.write(re.sub(r"evofsm(?! \d)", prefix, text).encode())
+            place.flush()
 
 
 def write_fmu(guard: Guard, file: Path) -> None:
@@ -151,20 +153,23 @@ def _texts(guard: Guard, unit: str = "") -> dict[str, str]:
     m, a = sizes["VARIABLES"], sizes["ACTIONS"]
     variables = ", ".join(names) or "variables in their order"
     about = visible(f"{frozen}\nan observation: {variables}\n{part.about}").replace("\n", "\n   ")
-    learnt = _written({**constants, **part.constants})
+    start = constants["fallback"].tolist()
     texts = {
         "TOOL": f"evofsm {__version__}",
         "ABOUT": re.sub("(?<=[*/?])(?=[*/?])", " ", about),  # neither a comment nor a trigraph
         "SIZES": _written({f"EVOFSM_{name}": value for name, value in sizes.items()}),
         "STATE": judge["state"],
-        "CONSTANTS": learnt,
+        "CONSTANTS": _written({**constants, **part.constants}),
         "SOURCE": judge["source"],
         "NAME": unit,
-        "GUID": hashlib.sha256(learnt.encode()).hexdigest(),
         "STEP": repr(guard.interval),
-        "VARIABLES": _variables(names or range(m), a, whole=sizes["CHOICES"] > 0),
+        "FALLBACK": f"{', '.join(f'{value:g}' for value in start)} ({reviser.fallback.doing})",
+        "START": _number(start),
+        "VARIABLES": _variables(names or range(m), start, whole=sizes["CHOICES"] > 0),
         "OUTPUTS": "".join(f'<Unknown index="{m + a + k}"/>' for k in range(1, a + 4)),
     }
+    texts["GUID"] = hashlib.sha256(f"{texts}{common}".encode()).hexdigest()
+    texts["GUARD"] = f"0x{texts['GUID'][:8]}u"
     pattern = re.compile("UNIT_([A-Z]+)")
     return {of: pattern.sub(lambda found: texts[found[1]], text) for of, text in common.items()}
 
@@ -177,18 +182,19 @@ def _told(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(f"{k}: {line}" for k, line in enumerate(lines, start=1))
 
 
-def _variables(names: Sequence[object], a: int, *, whole: bool) -> str:
+def _variables(names: Sequence[object], start: Sequence[float], *, whole: bool) -> str:
     """Variables of an FMU for its description, in the order of ``fmi2.c``."""
+    a, starts = len(start), [*[0.0] * len(names), *start, *start, 0.0, 0.0, 0.0]
     m, columns = len(names), [f"observation[{name}]" for name in names]
     acts = [f"{act}[{i}]" for act in ("proposal", "executed") for i in range(a)]
     kinds = ["Real"] * m + ["Integer" if whole else "Real"] * (2 * a)
     kinds += ["Real", "Integer", "Boolean"]
     how = ['"input"'] * (m + a) + ['"output" initial="exact"'] * (a + 3)
-    every = zip([*columns, *acts, "risk", "reason", "revised"], kinds, how, strict=True)
+    every = zip([*columns, *acts, "risk", "reason", "revised"], kinds, how, starts, strict=True)
     return "".join(
-        f'    <ScalarVariable name={quoteattr(name)} valueReference="{k}" '
-        f'causality={causality} variability="discrete"><{kind} start="0"/></ScalarVariable>\n'
-        for k, (name, kind, causality) in enumerate(every)
+        f'    <ScalarVariable name={quoteattr(name)} valueReference="{k}" causality={causality} '
+        f'variability="discrete"><{kind} start="{begin:.17g}"/></ScalarVariable>\n'
+        for k, (name, kind, causality, begin) in enumerate(every)
     )
 
 

@@ -8,6 +8,8 @@
 #ifndef EVOFSM_H
 #define EVOFSM_H
 
+/* Of which export all files are. */
+#define EVOFSM_GUARD UNIT_GUARD
 UNIT_SIZES
 #ifdef __cplusplus
 extern "C" {
@@ -16,8 +18,11 @@ extern "C" {
 /* What evofsm_decide returns. But for EVOFSM_OK nothing has changed, and nothing was written. */
 enum {
   EVOFSM_OK = 0,
-  EVOFSM_UNUSABLE = 1, /* an entry of the observation, or the time, is infinite, or cannot be so */
-  EVOFSM_MISCOMPILED = 2 /* it does not compute as IEEE 754 says, so that nothing is decided */
+  EVOFSM_UNUSABLE = 1, /* an entry of the observation, or the time, is infinite, or cannot be so:
+                          ask again with NaN for such an entry, or execute a safe action of yours;
+                          the time that evofsm_decide counts goes on with EVOFSM_OK alone */
+  EVOFSM_MISCOMPILED = 2 /* it does not compute as IEEE 754 says, rounding to nearest, so that
+                            nothing is decided */
 };
 
 /* Why something is executed. */
@@ -35,7 +40,8 @@ enum {
   EVOFSM_AVOIDED = 10        /* cars: braking that avoids one */
 };
 
-/* What had to be done to a proposal. */
+/* What had to be done to a proposal. One that is no action (NaN) is replaced by
+   UNIT_FALLBACK, which then is judged as any is: propose a safer one of yours, if that is not. */
 enum { EVOFSM_AS_PROPOSED = 0, EVOFSM_OUTSIDE = 1, EVOFSM_NO_PROPOSAL = 2 };
 
 /* What was wrong with an observation: a sum. */
@@ -73,7 +79,8 @@ UNIT_STATE} evofsm_state;
 /* An episode begins with the next decision. To be called before the first one, too. */
 void evofsm_reset(evofsm_state *state);
 
-/* Decide on an observation, EVOFSM_INTERVAL seconds after the one before; NaN: not seen. */
+/* Decide on an observation, EVOFSM_INTERVAL seconds after the one before; NaN: not seen. Where the
+   processor traps FE_INVALID, comparing NaN would end the program: mask it around the call. */
 int evofsm_decide(evofsm_state *state, const double observation[EVOFSM_VARIABLES],
                   const double proposal[EVOFSM_ACTIONS], evofsm_decision *out);
 
@@ -95,6 +102,10 @@ int evofsm_decide_at(evofsm_state *state, const double observation[EVOFSM_VARIAB
 
 #include "evofsm.h"
 
+#if EVOFSM_GUARD != UNIT_GUARD
+#error "evofsm.hpp and evofsm.h are of different exports: take all files of one"
+#endif
+
 // No namespace, which could not be called as a function of the C library is.
 struct evofsm {
 
@@ -110,7 +121,7 @@ class Guard {
   // An episode begins.
   void reset() noexcept { evofsm_reset(&state_); }
 
-  // What to execute; empty where the observation cannot be used: then nothing has changed.
+  // What to execute; empty where evofsm_decide_at does not return EVOFSM_OK.
   std::optional<Decision> decide(const Observation& observation, const Action& proposal) noexcept {
     return decide_at(observation, proposal, state_.decisions * EVOFSM_INTERVAL);
   }
@@ -137,6 +148,9 @@ class Guard {
 #include <math.h>
 #include <string.h>
 
+#if EVOFSM_GUARD != UNIT_GUARD
+#error "evofsm.c and evofsm.h are of different exports: take all files of one"
+#endif
 /* NaN is "not seen" and "nothing proposed", and decisions are the same to the bit. */
 #if defined __FAST_MATH__ || __FINITE_MATH_ONLY__ || defined __ASSOCIATIVE_MATH__ || \
     defined __RECIPROCAL_MATH__ || defined __NO_SIGNED_ZEROS__ || defined _M_FP_FAST || \
@@ -235,7 +249,7 @@ static int is_exact(void) {
   static const volatile double given[] = {1.0, 1e-18, 49.0, 98.0, 147.0, NAN};
   const double one = given[0], small = given[1], by = given[2], none = given[5];
   const double parts = given[2] / by + given[3] / by + given[4] / by;
-  return (one + small) - one == 0.0 && parts == 6.0 && isnan(none) && !(none <= one);
+  return (one + small) - one == 0.0 && one - small == one && parts == 6.0 && isnan(none) && !(none <= one);
 }
 
 void evofsm_reset(evofsm_state *state) {
@@ -353,6 +367,9 @@ enum {
   VALUES
 };
 
+/* Proposed, and executed, until there is another. */
+static const double fallback[EVOFSM_ACTIONS] = UNIT_START;
+
 typedef struct {
   evofsm_state state;
   double values[VALUES];
@@ -385,6 +402,8 @@ EXPORT fmi2Status fmi2Reset(void *c) {
   unit *of = c;
   evofsm_reset(&of->state);
   memset(of->values, 0, sizeof of->values);
+  memcpy(of->values + PROPOSAL, fallback, sizeof fallback);
+  memcpy(of->values + EXECUTED, fallback, sizeof fallback);
   of->wait = 0.0;
   return fmi2OK;
 }
