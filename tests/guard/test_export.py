@@ -142,6 +142,14 @@ def test_no_name_gets_out_of_its_place(wall, names, tmp_path):
     variables = [one.name for one in told.modelVariables]
     assert len({*variables}) == 7
     assert all(map(str.isprintable, variables))
+    guard.save(tmp_path / "guard")
+    guard = Guard.load(tmp_path / "guard")
+    with pytest.raises(ValueError, match="must lie between") as wrong:
+        guard.decide([math.inf, 0.0], 0.0)
+    guard.explaining = True
+    told = [guard.decide([math.nan, 0.9][::way], 1.0) for way in (1, -1)]
+    texts = *(one.reason + one.explanation for one in told), *str(guard).split("\n")
+    assert all(map(str.isprintable, (str(wrong.value), *texts)))
 
 
 class Own(LatentRisk):

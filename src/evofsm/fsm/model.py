@@ -17,7 +17,7 @@ from evofsm.fsm.arrays import MODEL, OF_MODEL
 from evofsm.fsm.clusters import recognise_rows
 from evofsm.fsm.explanation import Explanation, Nearest, explain
 from evofsm.fsm.kernels import lanes
-from evofsm.fsm.naming import Labels
+from evofsm.fsm.naming import Labels, in_a_line
 from evofsm.fsm.rules import Paper, StateRule, describe_rule, reach, restore_rule, weights_of
 from evofsm.fsm.validation import Floats
 from evofsm.store import Place
@@ -210,7 +210,7 @@ class FSMModel:
         return explain(self, belief, index, self.labels, nearest)
 
     def __repr__(self) -> str:
-        variables = ", ".join(self.names) or f"{self.n_variables} variables"
+        variables = in_a_line(", ".join(self.names)) or f"{self.n_variables} variables"
         return (
             f"{type(self).__name__}({self.n_states} states of {variables}, "
             f"{self.n_actions} actions, {self.visits.sum():.0f} observations, {self.rule})"

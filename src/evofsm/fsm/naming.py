@@ -68,14 +68,14 @@ class Labels(NamedTuple):
             return f"({', '.join(values)})"
         units = self.units or ("",) * len(values)
         entries = zip(self.names, values, units, strict=True)
-        return ", ".join(" ".join(part for part in parts if part) for parts in entries)
+        return in_a_line(", ".join(" ".join(part for part in parts if part) for parts in entries))
 
     def variable(self, index: int) -> str:
         """Name and unit of a variable (from 0), as far as they are known."""
         if not self.names:
             return f"variable {index + 1}"
         unit = self.units[index] if self.units else ""
-        return f"{self.names[index]} [{unit}]" if unit else self.names[index]
+        return in_a_line(f"{self.names[index]} [{unit}]" if unit else self.names[index])
 
     def action(self, index: int) -> str:
         """An action (from 0) with its interval, where that is known."""

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from evofsm import store
 from evofsm.fsm.kernels import compiled, kernel
-from evofsm.fsm.naming import Labels
+from evofsm.fsm.naming import Labels, in_a_line
 from evofsm.fsm.proportions import wilson_bounds
 from evofsm.fsm.validation import positive, refuse_unusable
 from evofsm.guard.actions import Action
@@ -459,9 +459,9 @@ class Foresight(LearningJudge):
     def _words(self, limit: Floats) -> tuple[str, str]:
         v, when, sign, at = int(limit[_OF]), int(limit[_WHEN]), limit[_SIGN], limit[_AT]
         soon = f" in {span(_AHEAD[when] * self.horizon * self.dt)} at its rate" * (when > 0)
-        names, m = self.labels.names, len(self.labels.names)
+        names, m = [*map(in_a_line, self.labels.names)], len(self.labels.names)
         if v < m:
-            unit = f" {units[v]}" if (units := self.labels.units) and units[v] else ""
+            unit = f" {in_a_line(units[v])}" if (units := self.labels.units) and units[v] else ""
             return names[v], f"{'above' if sign > 0.0 else 'below'} {at:.4g}{unit}{soon}"
         row = self.forms[v - m].copy()
         is_flat = not row[failure.P : failure.HELD].any()

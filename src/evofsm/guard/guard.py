@@ -22,7 +22,7 @@ from evofsm.fsm.explanation import explain
 from evofsm.fsm.kernels import COMPILES, announce_compiling
 from evofsm.fsm.machine import EvolvingFSM, opened
 from evofsm.fsm.model import FSMModel
-from evofsm.fsm.naming import Labels
+from evofsm.fsm.naming import Labels, in_a_line
 from evofsm.fsm.rules import reach
 from evofsm.fsm.sharing import Rollback, alone, share, transaction
 from evofsm.fsm.validation import function, number, positive, real_array, usable_array
@@ -590,7 +590,7 @@ class Guard:
         count = len(self.variables) or getattr(judge, "n_variables", 0)
         count = count or (0 if machine is None else machine.n_variables) or len(self._held)
         if count and len(z) != count:
-            names = f" ({', '.join(self.variables)})" if self.variables else ""
+            names = in_a_line(f" ({', '.join(self.variables)})") if self.variables else ""
             raise ValueError(f"observation has {len(z)} variables; it must have {count}{names}")
         if fault := self.beyond(z):
             raise ValueError(" ".join(fault))
@@ -603,7 +603,7 @@ class Guard:
         if True not in (wrong := ((z < least) | (z > most)).tolist()):
             return None
         k = wrong.index(True)
-        name = self.variables[k] if self.variables else f"observation[{k}]"
+        name = in_a_line(self.variables[k]) if self.variables else f"observation[{k}]"
         return name, (
             f"is {z[k]:g}; it must lie between {least[k]:g} and {most[k]:g} (another unit, or "
             "direction, or does it stand for what was not seen? That is NaN, in JSON null)"

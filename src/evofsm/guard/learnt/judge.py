@@ -625,7 +625,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
     @property
     def called(self) -> Sequence[str]:
         """Names of variables, as people read them."""
-        return self.labels.names or [f"variable {j + 1}" for j in range(self.n_variables)]
+        return [Labels(names=self.labels.names).variable(j) for j in range(self.n_variables)]
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write what was learnt to a file, with what it learnt from, for people (`provenance`)."""

@@ -28,6 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evofsm.fsm.naming import in_a_line
 from evofsm.fsm.validation import counted
 from evofsm.guard.harm import Harm
 from evofsm.guard.learnt import failure
@@ -235,7 +236,7 @@ def region(names: Sequence[str], row: Sequence[float], count: int, what: str = "
     """
     note = f"({counted(count, what)})"
     i, j, at, to, sx, sy, c, b, d, p, q, r = row
-    x, y = names[int(i)], names[int(j)]
+    x, y = in_a_line(names[int(i)]), in_a_line(names[int(j)])
     if i == j:
         if p == 0.0 and b != 0.0:
             beyond = _figures(at - c / (b * sx), sx, 4)
