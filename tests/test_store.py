@@ -191,7 +191,9 @@ def chosen_2(told, entries, numbers):
 HARMFUL = {
     "newer": (header_with(version=2), "version 2 is newer than this library's 1; a newer evofsm"),
     "settings of none": (header_with(settings=None), "does not say what it holds"),
-    "more in the header": (header_with(pickle="cos"), "pickle"),
+    "more in the header": (header_with(pickle="cos"), "its header does not say what it"),
+    "more of an array": (array_with("values", pickle="cos"), "its header is damaged"),
+    "what no terminal is to see": (array_with("values", dtype="\x1b[2J"), r"of \\x1b\[2J is"),
     "null": (settings_with(n_kinds=None), "lacks n_kinds"),
     "negative": (settings_with(n_kinds=-1), "n_kinds of -1 cannot be right"),
     "a float": (settings_with(n_kinds=2.0), "n_kinds holds a fraction; it must be an integer"),

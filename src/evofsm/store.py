@@ -353,16 +353,17 @@ def _unpacked(file: BinaryIO) -> tuple[Header, dict[str, _Entry], bytes, str]:
         metadata = index.pop("__metadata__")
         header_fields, sha256 = json.loads(metadata["evofsm"]), str(metadata["sha256"])
         version = header_fields["version"]
+        entries, begin = {name: _Entry(**fields) for name, fields in index.items()}, 0
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
         raise ValueError("it is another program's file, or its header is damaged") from None
     if type(version) is int and version > _VERSION:
         versions = f"its version {version} is newer than this library's {_VERSION}"
         raise ValueError(f"{versions}; a newer evofsm reads it")
-    header = Header(**header_fields)
-    types = (str, int, str, dict, dict)
-    if tuple(map(type, header)) != types or not re.fullmatch("[a-z]{1,20}", header.kind):
+    types = dict(zip(Header._fields, (str, int, str, dict, dict), strict=True))
+    has_all = {name: type(value) for name, value in header_fields.items()} == types
+    if not has_all or not re.fullmatch("[a-z]{1,20}", header_fields["kind"]):
         raise ValueError("its header does not say what it holds")
-    entries, begin = {name: _Entry(**fields) for name, fields in index.items()}, 0
+    header = Header(**header_fields)
     for name, entry in entries.items():
         begin = _end_of(name, entry, begin)
     if begin != size - 8 - length:
@@ -458,9 +459,9 @@ def _is(value: Any, kind: Any) -> bool:
 def explained(place: Place) -> Iterator[None]:
     """Turn whatever reading a damaged file runs into into one error that names the file."""
     try:
-        yield
+        yield  # an error may quote what the file has
     except _DAMAGE as error:
-        why = str(error)[:300]  # it may quote a damaged file
+        why = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(error)[:300])
         raise ValueError(f"{_named(place)} cannot be loaded: {why}") from error
 
 

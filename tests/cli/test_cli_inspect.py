@@ -46,6 +46,7 @@ def test_an_observation_is_recognised_and_an_action_counted(evofsm, saved):
     [
         (("--state", 0), "--state is 0; there are 1 to"),
         (("--observation", "a,b"), "write numbers"),
+        (("--observation", "9,nan,14"), "--observation is '9,nan,14'; write numbers"),
         (("--observation", "1,2,3", "--state", 1), "name one situation"),
         (("--observation", "1,2"), "--observation has 2 values; it needs "),
         (("--state", 1, "--action", 99), "--action is 99; there are 1 to 17"),

@@ -101,8 +101,10 @@ def _index(option: str, number: object, count: int) -> int:
 
 
 def _values(text: str) -> list[float]:
+    from evofsm.fsm.validation import usable_array
+
     try:
-        return [float(value) for value in text.split(",")]
+        return list(usable_array("it", [float(value) for value in text.split(",")]))
     except ValueError:
         raise ValueError(f"--observation is {text!r}; write numbers, such as 9,24,24") from None
 
