@@ -751,4 +751,4 @@ def _braked(source: str, runs: Sequence[Watched]) -> dict[str, Any]:
 
 def _unseen(seen: int) -> float:
     """At most so many percent are harder than the hardest of those seen (95 %), rounded up."""
-    return math.ceil(1000.0 * (1.0 - 0.05 ** (1.0 / seen) if seen else 1.0)) / 10.0
+    return math.ceil(1000.0 * (1.0 - 0.025 ** (1.0 / seen) if seen else 1.0)) / 10.0

@@ -216,4 +216,4 @@ def test_hard_brakes_are_counted_by_source_and_waves_once_and_knowledge_quiets_a
     assert nothing > own > table
     assert table <= 0.05 * 480
     page = asked.page(found)
-    assert "none of 3 was harder than the hardest says that at most 63.2 %" in page.tables[1].note
+    assert "none of 3 was harder than the hardest says that at most 70.8 %" in page.tables[1].note
