@@ -464,7 +464,8 @@ class Guard:
         observation : (m,) array_like
             NaN where a variable was not observed.
         proposal : float, (d,) array_like, Proposal or None
-            What the controller wants; None, or NaN, where it has nothing.
+            What the controller wants; None, or NaN, where it has nothing: a learnt judge is then
+            asked of the middle of the range, or action 0, which need not be safe.
             ``Proposal(action, mask=...)`` also says which actions are allowed now.
         time : float, optional
             Of the observation, in this episode [s]; without it decisions are counted, one every
