@@ -219,6 +219,7 @@ def test_episodes_that_come_back_are_refused_with_the_remedy(tmp_path, pieces):
         (HEADER.encode(), "has a header but no rows"),
         (b"# drive 7\n0,1\n1,2\n", "line 2: '0,1' is no header"),
         (b'# "x, m";y\n0;1\n1;2\n', "no column 'gap'; it has \"x, m\", y"),
+        (b"x\x1b[2J,y\n0,1\n1,2\n", r"it has x\u001b[2J, y"),
         (b"\x89MCAP0\r\n\x01" + bytes(8) + b"\4\0\0\0ros2", "is a bag of ROS 2; --topics"),
         (b"\x00\x01\x02\xff\xfe" * 50, "not text in UTF-8"),
         (b"\xfd7zXZ\0" + bytes(50), "compressed by xz; unpack it"),

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from evofsm.driving.naming import RANGES, VARIABLES
 from evofsm.driving.naming import UNITS as CAR_UNITS
+from evofsm.fsm.naming import in_a_line
 from evofsm.fsm.observations import Category, ObservationEncoder
 from evofsm.io import tables, vehicles
 from evofsm.io.tables import Piece, Skips, Table, Wanted, is_number
@@ -894,11 +895,12 @@ class _Reader:
         options.setdefault(columns.action, "--action")  # one that is observed, where nobody acts
         for name, option in options.items():
             if name not in table.columns:
-                short = [name[:40] for name in table.columns[:20]]
+                short = [in_a_line(name[:40]) for name in table.columns[:20]]
                 names = ", ".join(f'"{name}"' if "," in name else name for name in short)
                 more = f" and {len(table.columns) - 20:,} more" if len(table.columns) > 20 else ""
                 how = ", and --dt stands in for a clock" if option == "--time" else ""
-                if commas := [title for title in table.columns if "," in title and name in title]:
+                titles = map(in_a_line, table.columns)
+                if commas := [title for title in titles if "," in title and name in title]:
                     how = f"; a name with a comma stands in double quotes: '\"{commas[0]}\"'"
                 raise ValueError(
                     f"{table.path} has no column {name!r}; it has {names}{more} ({option} names "

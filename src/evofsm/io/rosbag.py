@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.extras import needs
+from evofsm.fsm.naming import in_a_line
 from evofsm.io import tables
 from evofsm.io.tables import UNITS, Piece, RefusedError, Skips, Table, Wanted, in_row, readable
 from evofsm.io.vehicles import ACTION
@@ -297,7 +298,7 @@ class BagTable(Table):
         if lack := sorted(topics - there):
             cut, has = self.skips.first.get("cut"), ", ".join(sorted(there)) or "no message"
             begins = f"{cut}; before that" if cut else f"{self.path}:"
-            raise ValueError(f"{begins} it has no topic {lack[0]!r}; it has {has}")
+            raise ValueError(f"{begins} it has no topic {lack[0]!r}; it has {in_a_line(has)}")
         if self._topics.stamp == "received":
             self._compare(spans)
         series: dict[str, _Values] = {}
