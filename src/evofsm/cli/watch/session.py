@@ -156,17 +156,6 @@ class OnRoads:
         self._closing.close()
 
 
-def system_machine(n_actions: int, seen: NDArray[np.float64]) -> EvolvingFSM:
-    """A machine for looking on at any system of which some rows (T, m) are known."""
-    spreads = [spread or 1.0 for spread in seen.std(0).tolist()]
-    return EvolvingFSM(
-        n_actions,
-        rule=Novelty(_STATES_APART * math.sqrt(seen.shape[1]), spreads),
-        max_states=_MOST_STATES,
-        belief_tolerance=BELIEF_TOLERANCE,
-    )
-
-
 # -- Any environment ------------------------------------------------------------------------------
 
 
@@ -203,7 +192,10 @@ class Simulated:
         guard = Guard(**ends, interval=self.interval, judge=judge, tolerance=tolerance)
         self._terms = gym.Terms(guard, env.observation_space, env.action_space, None, failed, 0.0)
         observations = np.array([z for k in range(_LOOKED_AT) for z in self._run(env, -1 - k)])
-        machine = system_machine(guard.actions.n_actions, observations)
+        spreads = [spread or 1.0 for spread in observations.std(0).tolist()]
+        rule = Novelty(_STATES_APART * math.sqrt(len(spreads)), spreads)
+        bounds: Any = {"max_states": _MOST_STATES, "belief_tolerance": BELIEF_TOLERANCE}
+        machine = EvolvingFSM(guard.actions.n_actions, rule=rule, **bounds)
         self.guard = Guard.of(guard.reviser, interval=self.interval, machine=machine)
         names = names or [f"variable {k + 1}" for k in range(observations.shape[1])]
         self.labels = Labels(names=tuple(names), units=tuple(units), dt=self.interval)
