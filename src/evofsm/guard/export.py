@@ -153,7 +153,8 @@ def _texts(guard: Guard, unit: str = "") -> dict[str, str]:
     m, a = sizes["VARIABLES"], sizes["ACTIONS"]
     variables = ", ".join(names) or "variables in their order"
     about = visible(f"{frozen}\nan observation: {variables}\n{part.about}").replace("\n", "\n   ")
-    start = constants["fallback"].tolist()
+    doing = constants["fallback"].tolist()
+    starts = [*[0.0] * m, *doing, *doing, *[0.0] * 3]  # of an FMU, in the order of fmi2.c
     texts = {
         "TOOL": f"evofsm {__version__}",
         "ABOUT": re.sub("(?<=[*/?])(?=[*/?])", " ", about),  # neither a comment nor a trigraph
@@ -163,9 +164,9 @@ def _texts(guard: Guard, unit: str = "") -> dict[str, str]:
         "SOURCE": judge["source"],
         "NAME": unit,
         "STEP": repr(guard.interval),
-        "FALLBACK": f"{', '.join(f'{value:g}' for value in start)} ({reviser.fallback.doing})",
-        "START": _number(start),
-        "VARIABLES": _variables(names or range(m), start, whole=sizes["CHOICES"] > 0),
+        "FALLBACK": f"{', '.join(f'{value:g}' for value in doing)} ({reviser.fallback.doing})",
+        "START": _number(starts),
+        "VARIABLES": _variables(names or range(m), starts, whole=sizes["CHOICES"] > 0),
         "OUTPUTS": "".join(f'<Unknown index="{m + a + k}"/>' for k in range(1, a + 4)),
     }
     texts["GUID"] = hashlib.sha256(f"{texts}{common}".encode()).hexdigest()
@@ -182,10 +183,10 @@ def _told(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(f"{k}: {line}" for k, line in enumerate(lines, start=1))
 
 
-def _variables(names: Sequence[object], start: Sequence[float], *, whole: bool) -> str:
+def _variables(names: Sequence[object], starts: Sequence[float], *, whole: bool) -> str:
     """Variables of an FMU for its description, in the order of ``fmi2.c``."""
-    a, starts = len(start), [*[0.0] * len(names), *start, *start, 0.0, 0.0, 0.0]
     m, columns = len(names), [f"observation[{name}]" for name in names]
+    a = (len(starts) - m - 3) // 2
     acts = [f"{act}[{i}]" for act in ("proposal", "executed") for i in range(a)]
     kinds = ["Real"] * m + ["Integer" if whole else "Real"] * (2 * a)
     kinds += ["Real", "Integer", "Boolean"]

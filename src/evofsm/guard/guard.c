@@ -19,10 +19,8 @@ extern "C" {
 enum {
   EVOFSM_OK = 0,
   EVOFSM_UNUSABLE = 1, /* an entry of the observation, or the time, is infinite, or cannot be so:
-                          ask again with NaN for such an entry, or execute a safe action of yours;
-                          the time that evofsm_decide counts goes on with EVOFSM_OK alone */
-  EVOFSM_MISCOMPILED = 2 /* it does not compute as IEEE 754 says, rounding to nearest, so that
-                            nothing is decided */
+                          ask again with NaN for it, or act safely; the counted time stands */
+  EVOFSM_MISCOMPILED = 2 /* it does not compute as IEEE 754 says, rounding to nearest */
 };
 
 /* Why something is executed. */
@@ -172,6 +170,12 @@ UNIT_CONSTANTS
 static double lesser(double one, double other) { return other < one ? other : one; }
 static double greater(double one, double other) { return other > one ? other : one; }
 
+static void fill(double values[], int n, double value) {
+  for (n--; n >= 0; n--) {
+    values[n] = value;
+  }
+}
+
 UNIT_SOURCE
 /* -- States: nearest_center of clusters.py, the most probable one ------------------------------ */
 
@@ -249,15 +253,13 @@ static int is_exact(void) {
   static const volatile double given[] = {1.0, 1e-18, 49.0, 98.0, 147.0, NAN};
   const double one = given[0], small = given[1], by = given[2], none = given[5];
   const double parts = given[2] / by + given[3] / by + given[4] / by;
-  return (one + small) - one == 0.0 && one - small == one && parts == 6.0 && isnan(none) && !(none <= one);
+  const int is_rounded = (one + small) - one == 0.0 && one - small == one && parts == 6.0;
+  return is_rounded && isnan(none) && !(none <= one);
 }
 
 void evofsm_reset(evofsm_state *state) {
-  int j;
   memset(state, 0, sizeof *state);
-  for (j = 0; j < EVOFSM_VARIABLES; j++) {
-    state->held[j] = NAN;
-  }
+  fill(state->held, EVOFSM_VARIABLES, NAN);
   state->time = NAN;
   forget(state);
 }
@@ -367,8 +369,7 @@ enum {
   VALUES
 };
 
-/* Proposed, and executed, until there is another. */
-static const double fallback[EVOFSM_ACTIONS] = UNIT_START;
+static const double start[VALUES] = UNIT_START;
 
 typedef struct {
   evofsm_state state;
@@ -393,7 +394,6 @@ static fmi2Status fail(const unit *of, const char *message) {
   EXPORT fmi2Status fmi2##Name(__VA_ARGS__) { return fmi2Error; }
 
 EXPORT const char *fmi2GetTypesPlatform(void) { return "default"; }
-
 EXPORT const char *fmi2GetVersion(void) { return "2.0"; }
 
 NOTHING(SetDebugLogging, void *c, int on, size_t count, const char *const names[])
@@ -401,9 +401,7 @@ NOTHING(SetDebugLogging, void *c, int on, size_t count, const char *const names[
 EXPORT fmi2Status fmi2Reset(void *c) {
   unit *of = c;
   evofsm_reset(&of->state);
-  memset(of->values, 0, sizeof of->values);
-  memcpy(of->values + PROPOSAL, fallback, sizeof fallback);
-  memcpy(of->values + EXECUTED, fallback, sizeof fallback);
+  memcpy(of->values, start, sizeof start);
   of->wait = 0.0;
   return fmi2OK;
 }
@@ -466,33 +464,23 @@ EXPORT fmi2Status fmi2DoStep(void *c, double time, double step, int no_return) {
   return fmi2OK;
 }
 
-#define GET(Type, type)                                                                       \
-  EXPORT fmi2Status fmi2Get##Type(void *c, const unsigned at[], size_t count, type values[]) { \
-    size_t i;                                                                                 \
-    for (i = 0; i < count; i++) {                                                             \
-      if (at[i] >= VALUES) {                                                                  \
-        return fail(c, "there is no variable with this value reference");                     \
-      }                                                                                       \
-      values[i] = (type)((unit *)c)->values[at[i]];                                           \
-    }                                                                                         \
-    return fmi2OK;                                                                            \
+#define ACCESS(Name, type, last, copy)                                                       \
+  EXPORT fmi2Status fmi2##Name(void *c, const unsigned at[], size_t count, type values[]) {   \
+    size_t i;                                                                                \
+    for (i = 0; i < count; i++) {                                                            \
+      double *const value = ((unit *)c)->values + at[i];                                     \
+      if (at[i] >= (last)) {                                                                 \
+        return fail(c, "there is no such variable, or none that can be set");                \
+      }                                                                                      \
+      copy;                                                                                  \
+    }                                                                                        \
+    return fmi2OK;                                                                           \
   }
-#define SET(Type, type)                                                                             \
-  EXPORT fmi2Status fmi2Set##Type(void *c, const unsigned at[], size_t count, const type values[]) { \
-    size_t i;                                                                                       \
-    for (i = 0; i < count; i++) {                                                                   \
-      if (at[i] >= EXECUTED) {                                                                      \
-        return fail(c, "there is no input with this value reference");                              \
-      }                                                                                             \
-      ((unit *)c)->values[at[i]] = values[i];                                                       \
-    }                                                                                               \
-    return fmi2OK;                                                                                  \
-  }
-GET(Real, double)
-GET(Integer, int)
-GET(Boolean, int)
-SET(Real, double)
-SET(Integer, int)
+ACCESS(GetReal, double, VALUES, values[i] = *value)
+ACCESS(GetInteger, int, VALUES, values[i] = (int)*value)
+ACCESS(GetBoolean, int, VALUES, values[i] = (int)*value)
+ACCESS(SetReal, const double, EXECUTED, *value = values[i])
+ACCESS(SetInteger, const int, EXECUTED, *value = values[i])
 
 LACKS(SetBoolean, void *c, const unsigned at[], size_t count, const int values[])
 LACKS(SetString, void *c, const unsigned at[], size_t count, const char *const values[])

@@ -8,7 +8,7 @@
   /* Observations of the last step, the oldest first, and what was done there. */
   double past[EVOFSM_STRIDE][EVOFSM_VARIABLES], acted[EVOFSM_STRIDE][EVOFSM_NUMBERS];
   int n_past, is_placed;         /* how many there are; and whether one knows where one is now */
-  int n_blind, lacks;            /* observations on end that lack something; whether this one does */
+  int n_blind, lacks, is_new;    /* rows on end that lack something; whether this one does, or is far */
   int ranks[EVOFSM_BACKUPS], done; /* backups, those first that passed last; steps of a search */
   /* Room of a rollout. */
   double z[EVOFSM_VARIABLES][EVOFSM_LANES], change[EVOFSM_VARIABLES][EVOFSM_LANES];
@@ -57,18 +57,11 @@ static void decode(const double inner[A], double action[EVOFSM_ACTIONS]) {
 
 /* -- A rollout ---------------------------------------------------------------------------------- */
 
-static void fill(double lanes[L], double value) {
-  int l;
-  for (l = 0; l < L; l++) {
-    lanes[l] = value;
-  }
-}
-
 /* _fill_features: those of situations and actions side by side, into s->found. */
 static void fill_features(evofsm_state *s, double harder) {
   static const double knots[3] = {-0.5, 0.0, 0.5};
   int i, j, k, l;
-  fill(s->found[0], 1.0);
+  fill(s->found[0], L, 1.0);
   for (j = 0; j < M; j++) {
     const double largest = harder * reach[j];
     for (l = 0; l < L; l++) {
@@ -126,7 +119,7 @@ static void follow_policy(evofsm_state *s, const double policy[A][1 + M], double
   int i, j, l;
   for (i = 0; i < A; i++) {
     double *now = s->now[i];
-    fill(now, policy[i][0]);
+    fill(now, L, policy[i][0]);
     for (j = 0; j < M; j++) {
       const double slope = policy[i][1 + j], middle_of = mean[j], over = inverse[j];
       for (l = 0; l < L; l++) {
@@ -167,9 +160,9 @@ static void from_centre(evofsm_state *s, int end) {
    s->over. */
 static void measure(evofsm_state *s) {
   int f, l;
-  fill(s->far, INFINITY);
-  fill(s->over, INFINITY);
-  fill(s->last, INFINITY);
+  fill(s->far, L, INFINITY);
+  fill(s->over, L, INFINITY);
+  fill(s->last, L, INFINITY);
   for (f = 0; f < FORMS; f++) {
     const double says = forms[f][0], *z = s->z[(int)forms[f][1]], *other_z = s->z[(int)forms[f][2]];
     const double at = forms[f][3], to = forms[f][4], one = forms[f][5], other = forms[f][6];
@@ -235,18 +228,18 @@ static void step(evofsm_state *s, int t, double harder) {
 static void place(evofsm_state *s) {
   int i, j;
   for (j = 0; j < M; j++) {
-    fill(s->z[j], s->here[j]);
-    fill(s->change[j], s->here[M + j]);
+    fill(s->z[j], L, s->here[j]);
+    fill(s->change[j], L, s->here[M + j]);
   }
   for (i = 0; i < A; i++) {
-    fill(s->before[i], s->here[2 * M + i]);
+    fill(s->before[i], L, s->here[2 * M + i]);
   }
 }
 
 static void act(evofsm_state *s, const double action[A]) {
   int i;
   for (i = 0; i < A; i++) {
-    fill(s->now[i], action[i]);
+    fill(s->now[i], L, action[i]);
   }
 }
 
@@ -257,7 +250,7 @@ static int rollout(evofsm_state *s, const double *action, const double policy[A]
   const double end = 1.0 - RESERVE * enough;
   int l, t, lost = 0, ended = 0;
   place(s);
-  fill(s->near, INFINITY);
+  fill(s->near, L, INFINITY);
   for (l = 0; l < L; l++) {
     s->survived[l] = l < K ? STEPS : -1;
   }
@@ -412,7 +405,7 @@ static int search(evofsm_state *s, const double proposal[A], double action[A], i
 static int foresee(evofsm_state *s, const double action[A]) {
   double best[L], left;
   int l, r, count = K;
-  fill(best, -INFINITY);
+  fill(best, L, -INFINITY);
   for (r = 0; r < JUDGED && count > 0; r++) {
     rollout(s, action, policies[s->ranks[r]], 1.0, 0.0, K, &left);
     count = 0;
@@ -429,10 +422,11 @@ static void situate(evofsm_state *s) {
   const int n = s->n_past;
   int i, j, t;
   s->is_placed = 1;
-  s->lacks = 0;
+  s->lacks = s->is_new = 0;
   for (j = 0; j < M; j++) {
     const double z = s->observation[j], times = n > 0 ? (double)EVOFSM_STRIDE / n : 0.0;
     s->lacks |= isnan(z) != 0;
+    s->is_new |= z < usual[0][j] || z > usual[1][j];
     s->here[j] = isnan(z) ? s->next[j] : z; /* before one was whole: as it was last */
     s->here[M + j] = n > 0 ? (s->here[j] - s->past[0][j]) * times : 0.0;
     s->is_placed &= !isnan(s->here[j]);
@@ -448,11 +442,8 @@ static void situate(evofsm_state *s) {
 
 static void forget(evofsm_state *s) {
   int i;
-  s->n_past = 0;
-  s->is_placed = s->n_blind = 0;
-  for (i = 0; i < M; i++) {
-    s->next[i] = NAN;
-  }
+  s->n_past = s->is_placed = s->n_blind = 0;
+  fill(s->next, M, NAN);
   for (i = 0; i < EVOFSM_BACKUPS; i++) {
     s->ranks[i] = i;
   }
@@ -461,13 +452,10 @@ static void forget(evofsm_state *s) {
 /* LearntRisk.search: what to execute of s->proposal, into s->best, and how risky that is. */
 static void revise(evofsm_state *s, evofsm_decision *out) {
   double proposal[A], action[A];
-  int j, r, is_known, is_new = 0, unsurvived = 0;
+  int r, is_known, unsurvived = 0;
   memcpy(s->best, s->proposal, sizeof s->best);
   situate(s);
-  for (j = 0; j < M; j++) { /* far from all that was seen */
-    is_new |= s->observation[j] < usual[0][j] || s->observation[j] > usual[1][j];
-  }
-  is_known = s->is_placed && !is_new && !(s->lacks && s->n_blind + 1 >= BLIND);
+  is_known = s->is_placed && !s->is_new && !(s->lacks && s->n_blind + 1 >= BLIND);
   out->evidence = is_known ? EVIDENCE : 0.0;
   if (!is_known) {
     out->reason = EVOFSM_NOTHING_SEEN;
@@ -476,7 +464,7 @@ static void revise(evofsm_state *s, evofsm_decision *out) {
   if (!s->is_placed) {
     return;
   }
-  out->seen = is_new ? 0.0 : out->seen;
+  out->seen = s->is_new ? 0.0 : out->seen;
   encode(s->proposal, proposal);
   out->reason = search(s, proposal, action, &out->backup, &out->left);
   for (r = 0; s->ranks[r] != out->backup; r++) { /* at most EVOFSM_BACKUPS: it is one of them */
