@@ -364,6 +364,7 @@ def test_a_rule_of_one_s_own_is_named_by_its_module_or_as_it_is_registered(
         (["--where", "gap>9999", "--resample", "30s"], "and --where gap>9999 must hold"),
         (["--action", "", "--tolerance", "0.1"], "--false-a-day counts"),
         (["--false-a-day", "1"], "--false-a-day is of alarms where nobody"),
+        (["--horizon", "5"], "--horizon is of alarms where nobody"),
     ],
 )
 def test_wrong_options_end_with_one_line(refused, log, options, message):

@@ -207,6 +207,7 @@ def test_a_summary_says_how_often_it_alarms_and_is_risky_and_where_it_is_worst(t
         (("--interval", -1), "interval"),
         (("--tolerance", 2), "tolerance is 2"),
         (("--guard", "nowhere", "--brakes", 5), "nowhere has learnt its own"),
+        (("--guard", "nowhere", "--n-actions", 3), "--n-actions is for a guard that is made here"),
         (("--observe", "heat", "--interval", 1), "say who acts: --low and --high, --n-actions"),
         (("--observe", "heat", "--low", 0, "--high", 1), "say how often rows come [s]"),
         (("--action", "", "--interval", 1), "say what is observed, the keys of rows: --observe"),

@@ -73,7 +73,8 @@ def learn(
     if guard is not None and out is not None and guard.resolve() == out.resolve():
         raise ValueError(f"--out and --guard are both {out}; give each a file of its own")
     own_tolerance = None if tolerance == options.TOLERANCE else tolerance
-    options.refuse_other_limit(columns.acts, false_a_day, own_tolerance)
+    alarms = horizon, persist, false_a_day
+    options.refuse_other_limit(columns.acts, alarms, own_tolerance)
     actions = learning.actions_of(action_range if columns.acts else "0:1:1")
     encoder = columns.observe
     machine = learning.machine_of(actions.n_actions, rule, scale, max_states, encoder)
@@ -117,7 +118,6 @@ def learn(
             if refusal := learning.refusing(share):
                 warn(f"warning: in the later half of the log the guard {refusal}")
         else:
-            alarms = horizon, persist, false_a_day
             episodes = [chunk for chunk in episodes_of(chunks) if len(chunk.times) > 1]
             new_guard = foreseen.guard_where_nobody_acts(
                 episodes, model.labels, *alarms, lesson.machine

@@ -262,10 +262,15 @@ FalseADay = Annotated[
 ]
 
 
-def refuse_other_limit(acts: bool, false_a_day: float | None, tolerance: float | None) -> None:
+#: What is said of alarms: --horizon, --persist and --false-a-day.
+Alarms = tuple[float | None, float, float | None]
+
+
+def refuse_other_limit(acts: bool, alarms: Alarms, tolerance: float | None) -> None:
     """Raise if what is said of alarms is said of somebody's actions, or the other way round."""
-    if acts and false_a_day is not None:
-        raise ValueError("--false-a-day is of alarms where nobody acts: --action ''")
+    for name, value in zip(("horizon", "persist", "false-a-day"), alarms, strict=True):
+        if acts and value not in (None, 0.0):
+            raise ValueError(f"--{name} is of alarms where nobody acts: --action ''")
     if not acts and tolerance is not None:
         raise ValueError("--tolerance is of actions; where nobody acts, --false-a-day counts")
 

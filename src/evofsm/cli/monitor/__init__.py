@@ -119,8 +119,12 @@ def monitor(
     from evofsm.guard import Foresight, Guard
     from evofsm.io.tables import is_number
 
-    if guard is not None and brakes != options.BRAKES:
-        raise ValueError(f"--brakes is for a guard that is made here; {guard} has learnt its own")
+    own_brakes = None if brakes == options.BRAKES else brakes
+    parts = {"low": low, "high": high, "n_actions": n_actions, "interval": interval}
+    parts |= {"brakes": own_brakes, "horizon": horizon, "persist": persist or None}
+    if guard is not None and (idle := [name for name, part in parts.items() if part is not None]):
+        name = idle[0].replace("_", "-")
+        raise ValueError(f"--{name} is for a guard that is made here; {guard} has learnt its own")
     accepted_risk = options.TOLERANCE if tolerance is None else tolerance
     alarms = horizon, persist, false_a_day
 
@@ -172,7 +176,7 @@ def monitor(
                 warning = f"{file} has a row every {interval:.2g} s, and {guard} decides each"
                 warn(f"warning: {warning} {sentry.interval:g} s: --resample {sentry.interval:g}s")
             if alone:
-                options.refuse_other_limit(False, false_a_day, tolerance)
+                options.refuse_other_limit(False, alarms, tolerance)
                 every, names = list(chunks), log_format.observe.names
                 about = names, notes.si_units(names), alarms, split, plot
                 show_foreseen(file, every, sentry, *about, as_json=as_json)
@@ -193,7 +197,7 @@ def monitor(
             warn("nothing of what is learnt is saved; --state FILE saves it")
         failed = new_guard.failed if new_guard else None
         sentry = fresh() if keeper is None else keeper.guard(fresh, failed)
-        prepare(sentry, mode, (tolerance, false_a_day), audit, stack, learn=learn)
+        prepare(sentry, mode, tolerance, alarms, audit, stack, learn=learn)
         if not (is_log or traffic):
             if observe is None or sentry.variables != VARIABLES:  # cars' may have other names
                 observe = options.quoted(sentry.variables or VARIABLES)

@@ -20,7 +20,7 @@ from evofsm.cli.foreseen import guard_of_alarms
 from evofsm.cli.monitor import messages
 from evofsm.cli.monitor.messages import End, Form, Message, MessageError, Pause, Row, Taken
 from evofsm.cli.monitor.slots import CsvRows, Slots
-from evofsm.cli.options import TOLERANCE, ModeName, reading_of, refuse_other_limit
+from evofsm.cli.options import TOLERANCE, Alarms, ModeName, reading_of, refuse_other_limit
 from evofsm.cli.show import plain
 from evofsm.driving import Object, Scene
 from evofsm.driving.judge import SLIGHT, LatentRisk
@@ -441,7 +441,7 @@ def begun(
     reading: Mapping[str, Any],
     interval: float | None,
     tolerance: float | None,
-    alarms: tuple[float | None, float, float | None],
+    alarms: Alarms,
 ) -> Guard:
     """A guard that knows nothing yet, from what was told of a system."""
     if "observe" not in told:
@@ -483,17 +483,17 @@ def begun(
 def prepare(
     guard: Guard,
     mode: ModeName,
-    limits: tuple[float | None, float | None],
+    tolerance: float | None,
+    alarms: Alarms,
     audit: Path | None,
     stack: ExitStack,
     *,
     learn: bool,
 ) -> None:
     """Set how far it goes, whether it learns, and who writes it down."""
-    tolerance, false_a_day = limits
-    refuse_other_limit(not isinstance(guard.judge, Foresight), false_a_day, tolerance)
-    if isinstance(guard.judge, Foresight) and false_a_day is not None:
-        guard.judge.stated = false_a_day
+    refuse_other_limit(not isinstance(guard.judge, Foresight), alarms, tolerance)
+    if isinstance(guard.judge, Foresight) and alarms[-1] is not None:
+        guard.judge.stated = alarms[-1]
     if isinstance(guard.reviser, ActionReviser):
         guard.reviser.mode = Mode(mode)
         if tolerance is not None:

@@ -403,7 +403,7 @@ def watched_log(
         why = f"nobody follows anybody for {_SHOWS}" if of_cars else "no episode has two"
         raise ValueError(f"{path}: {why} rows")
     rows = [stretch.rows for stretch in stretches]
-    refuse_other_limit(columns.acts, None, tolerance)
+    refuse_other_limit(columns.acts, (None, 0.0, None), tolerance)
     if guard is None:
         risk = TOLERANCE if tolerance is None else tolerance
         guard = guard_of_monitor(rows[0].dt, brakes, risk)
