@@ -201,7 +201,7 @@ def test_a_summary_says_how_often_it_alarms_and_is_risky_and_where_it_is_worst(t
         (("--summary",), "--summary needs FILE"),
         (("--episode", "0"), "--episode is '0'; it is a number of"),
         (("--mode", "drive"), "'drive' is not one of 'off', 'shadow', 'act'"),
-        (("--udp", 0, "--socket", "x"), "give one of FILE, --socket, --udp and --zenoh"),
+        (("--zenoh", "k", "--socket", "x"), "give one of FILE, --socket and --zenoh"),
         (("--guard", "nowhere"), "nowhere: no such file or directory"),
         (("nowhere.jsonl",), "nowhere.jsonl: no such file or directory"),
         (("--interval", -1), "interval"),
@@ -285,34 +285,23 @@ def test_a_reader_that_vanishes_ends_it_in_a_line():
 
 @posix
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "compiler", "flags"),
-    [
-        ("client.c", os.environ.get("CC", "cc"), ("-std=c99", "-D_POSIX_C_SOURCE=200809L")),
-        ("client.cpp", "g++", ()),
-    ],
-)
-def test_a_client_in_c_gets_its_alarm_by_a_socket_and_one_in_cpp_by_udp(
-    tmp_path, name, compiler, flags
-):
-    if shutil.which(shlex.split(compiler)[0]) is None:
+def test_a_client_in_c_gets_its_alarm_by_a_socket(tmp_path):
+    compiler = shlex.split(os.environ.get("CC", "cc"))
+    if shutil.which(compiler[0]) is None:
         pytest.skip("there is no such compiler")
-    source, path = tmp_path / name, tmp_path / "monitor.sock"
-    client = [tmp_path / "client", *[path] * (name == "client.c")]
-    with started("--warm", *(("--socket", path) if path in client else ("--udp", 0))) as process:
-        listens = next(one for one in iter(process.stderr.readline, b"") if b"listens" in one)
-        code = (EXAMPLES / name).read_text("utf-8")
-        source.write_text(code.replace("4444", listens.decode().split()[-1]))
-        build = [*shlex.split(compiler), *flags, "-Wall", "-Wextra", "-Werror"]
-        subprocess.run([*build, "-o", client[0], source], check=True)
-        done = subprocess.run(client, capture_output=True, text=True, timeout=PATIENCE)
+    path, client = tmp_path / "monitor.sock", tmp_path / "client"
+    with started("--warm", "--socket", path) as process:
+        next(one for one in iter(process.stderr.readline, b"") if b"listens" in one)
+        flags = "-std=c99", "-D_POSIX_C_SOURCE=200809L", "-Wall", "-Wextra", "-Werror"
+        subprocess.run([*compiler, *flags, "-o", client, EXAMPLES / "client.c"], check=True)
+        done = subprocess.run([client, path], capture_output=True, text=True, timeout=PATIENCE)
         process.terminate()
         status, _, said = ended(process)
     assert (status, said, path.exists()) == (0, "", False)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("alarm at " if path in client else "{")
+    assert done.stdout.startswith("alarm at ")
     assert json.loads(done.stdout[done.stdout.index("{") :])["alarm"]
-    assert subprocess.run(client, capture_output=True).returncode == 2  # it is gone
+    assert subprocess.run([client, path], capture_output=True).returncode == 2  # it is gone
 
 
 # -- Where nobody acts ----------------------------------------------------------------------------

@@ -153,8 +153,8 @@ def _texts(guard: Guard, unit: str = "") -> dict[str, str]:
     m, a = sizes["VARIABLES"], sizes["ACTIONS"]
     variables = ", ".join(names) or "variables in their order"
     about = visible(f"{frozen}\nan observation: {variables}\n{part.about}").replace("\n", "\n   ")
-    doing = constants["fallback"].tolist()
-    starts = [*[0.0] * m, *doing, *doing, *[0.0] * 3]  # of an FMU, in the order of fmi2.c
+    values = constants["fallback"].tolist()
+    starts = [*[0.0] * m, *values, *values, *[0.0] * 3]  # of an FMU, in the order of fmi2.c
     texts = {
         "TOOL": f"evofsm {__version__}",
         "ABOUT": re.sub("(?<=[*/?])(?=[*/?])", " ", about),  # neither a comment nor a trigraph
@@ -164,7 +164,7 @@ def _texts(guard: Guard, unit: str = "") -> dict[str, str]:
         "SOURCE": judge["source"],
         "NAME": unit,
         "STEP": repr(guard.interval),
-        "FALLBACK": f"{', '.join(f'{value:g}' for value in doing)} ({reviser.fallback.doing})",
+        "FALLBACK": f"{', '.join(f'{value:g}' for value in values)} ({reviser.fallback.doing})",
         "START": _number(starts),
         "VARIABLES": _variables(names or range(m), starts, whole=sizes["CHOICES"] > 0),
         "OUTPUTS": "".join(f'<Unknown index="{m + a + k}"/>' for k in range(1, a + 4)),

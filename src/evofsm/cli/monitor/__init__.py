@@ -51,9 +51,6 @@ def monitor(
         str | None, option("Rows of an episode at most, 6000; or columns that tell them apart.")
     ] = None,
     socket: Annotated[Path | None, option("Listen to a UNIX socket.")] = None,
-    udp: Annotated[
-        int | None, option("Listen to this port on 127.0.0.1; 0 for any.", min=0, max=65535)
-    ] = None,
     zenoh: Annotated[str | None, option("Rows at KEY/row, answers at KEY/decision.")] = None,
     text: Annotated[
         bool, option("Print alarms and failures alone, in words, for people.", "--text")
@@ -97,8 +94,8 @@ def monitor(
                 raise ValueError(f"one FILE is read; cat joins several, names and all: {path}")
             else:
                 file = path
-    if sum(source is not None for source in (file, socket, udp, zenoh)) > 1:
-        raise ValueError("give one of FILE, --socket, --udp and --zenoh")
+    if sum(source is not None for source in (file, socket, zenoh)) > 1:
+        raise ValueError("give one of FILE, --socket and --zenoh")
     if plot is not None and not summary:
         raise ValueError("--plot draws what --summary says, where nobody acts")
     if plot is not None:
@@ -227,7 +224,7 @@ def monitor(
                 warn(f"goes on after decision {decider.n} ({again} rows taken in again)")
         line = Text().line if text else json_line
         server = Server(decider, keeps=keeper is not None, line=line)
-        transport, where = transport_of(file, socket, udp, zenoh, stack)
+        transport, where = transport_of(file, socket, zenoh, stack)
         if keeper is not None and isinstance(transport, Stream) and file and file.is_file():
             transport.source.seek(keeper.pass_over(file, decider))
         warn(notice)

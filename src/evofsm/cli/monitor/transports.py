@@ -1,4 +1,4 @@
-"""How messages come and go: pipes, files, a UNIX socket, UDP on this computer, Zenoh.
+"""How messages come and go: pipes, files, a UNIX socket, Zenoh.
 
 A peer that sends junk, vanishes or does not read is no reason to end.
 """
@@ -27,7 +27,7 @@ from evofsm.extras import needs
 from evofsm.fsm.naming import visible
 
 _CHUNK = 1 << 16  # so much is read at once [byte]
-_MOST_LINES = 100  # so many lines may come in one datagram or sample
+_MOST_LINES = 100  # so many lines may come in one sample
 _POLL = 0.005  # what would block is tried again after so long [s]
 _LONGEST_WAIT = 0.5  # a signal that another thread took is seen after so long [s]
 
@@ -148,7 +148,7 @@ class SocketTransport:
 
     def __init__(self, path: Path) -> None:
         if not hasattr(socket, "AF_UNIX"):
-            raise ValueError("this system has no UNIX sockets; --udp PORT carries the same")
+            raise ValueError("this system has no UNIX sockets; --zenoh KEY carries the same")
         self.path = path
         self._peers: dict[socket.socket, threading.Lock] = {}
         _make_way(path)
@@ -214,38 +214,6 @@ def _make_way(path: Path) -> None:
     path.unlink(missing_ok=True)
 
 
-class UdpTransport:
-    """Answers datagrams from this computer, a line or some of them in each, to their senders."""
-
-    def __init__(self, port: int) -> None:
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        try:
-            self._socket.bind(("127.0.0.1", port))
-        except OSError as error:
-            self._socket.close()
-            error.filename = f"UDP port {port}"
-            raise
-        self.port: int = self._socket.getsockname()[1]
-        self._sender: Any = None
-
-    def serve(self, server: Server) -> None:
-        """Answer each sender, until it is closed."""
-        while self._socket.fileno() >= 0:
-            with suppress(OSError):  # the sender is gone
-                data, self._sender = self._socket.recvfrom(_CHUNK)
-                self.send(server.answer_packet(data))
-
-    def send(self, line: bytes) -> None:
-        """Send each line to who sent the latest."""
-        for part in line.splitlines(keepends=True) if self._sender else ():
-            with suppress(OSError):
-                self._socket.sendto(part, self._sender)
-
-    def close(self) -> None:
-        """Let others have the port."""
-        self._socket.close()
-
-
 class ZenohTransport:
     """Takes messages under ``KEY/row``, and puts answers under ``KEY/decision``."""
 
@@ -282,23 +250,20 @@ class ZenohTransport:
         self._session.close()  # type: ignore[no-untyped-call]
 
 
-Transport = Stream | SocketTransport | UdpTransport | ZenohTransport
+Transport = Stream | SocketTransport | ZenohTransport
 
 
 def transport_of(
-    file: Path | None, unix: Path | None, udp: int | None, zenoh: str | None, stack: ExitStack
+    file: Path | None, unix: Path | None, zenoh: str | None, stack: ExitStack
 ) -> tuple[Transport, str]:
     """Where rows come from, and that in words."""
     if unix is not None:
         return SocketTransport(unix), f"listens to {unix}"
-    if udp is not None:
-        by_udp = UdpTransport(udp)
-        return by_udp, f"listens to UDP port {by_udp.port}"
     if zenoh is not None:
         return ZenohTransport(zenoh), f"listens to {zenoh}/row"
     if file is None and sys.stdin is None:
-        raise ValueError("standard input is closed; give FILE, --socket, --udp or --zenoh")
+        raise ValueError("standard input is closed; give FILE, --socket or --zenoh")
     if sys.stdout is None:
-        raise ValueError("standard output is closed; give --socket, --udp or --zenoh")
+        raise ValueError("standard output is closed; give --socket or --zenoh")
     source = sys.stdin.buffer if file is None else stack.enter_context(file.open("rb"))
     return Stream(source, sys.stdout.buffer), f"reads {file or 'standard input'}"
