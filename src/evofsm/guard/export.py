@@ -264,7 +264,7 @@ def _learnt(reviser: ActionReviser) -> Part:
         "dead_ends": model.dead_ends if len(model.dead_ends) else np.zeros((1, m + 2)),
         "residuals": rest[:, :, [*range(count), *[0] * (lanes - count)]],  # others are undisturbed
         "policies": state.policies,
-        "usual": risk.usual,
+        "usual": parts.usual,
         "risks": [risk._risk(n, soon) for n in (math.inf, *map(float, range(count)))],
         "middle": risk.middle,
         "half": risk.half,

@@ -268,8 +268,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         """
         if not self.n_variables:
             rollout.refuse_too_many(len(situation.observation), self.size, box=not self.choices)
-        z, options, parts = situation.observation, np.array([wanted]), self.parts
-        here = self._here(z)
+        here, options, parts = self._here(situation.observation), np.array([wanted]), self.parts
         if parts is None or here is None or not len(self.state.forms):
             self._certified = False
             why = words.NOTHING_SEEN if parts and here is None else self._no_threshold
@@ -305,10 +304,10 @@ class LearntRisk(ObservingJudge, SearchingJudge):
             outcomes.append(Consequence(0.0, slack, 0.0))
         else:
             outcomes.append(self._foresee(here, action, policies))
-        alone = words.BY_MODEL if self._is_beyond(z) or self._is_blind(z) else ""
         self._lost = math.isinf(outcomes[-1].unsurvived)
         self._fails_after = max(self._fails_after, *(outcome.fails_after for outcome in outcomes))
         judgement = self._judged(situation, outcomes)
+        alone = words.BY_MODEL if math.isnan(judgement.risk[0]) else ""
         backup = self.backup_text(best, policies)
         if not self._refused:
             return Search(options, judgement, 0, alone + words.kept(backup, memory, slack))
@@ -360,30 +359,16 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         counts = [outcome.unsurvived for outcome in outcomes]
         self._unsurvived = -1 if math.isinf(counts[0]) else int(counts[0])
         memory = self.remembered
-        if self._is_beyond(situation.observation):
+        assert self.parts is not None
+        z, (least, most) = situation.observation, self.parts.usual
+        if ((z < least) | (z > most)).any():
             return _unjudged(len(counts))._replace(seen=0.0)
-        if self._is_blind(situation.observation):
+        if self._n_blind + 1 >= self.BLIND and is_missing(z):
             return _unjudged(len(counts))
         soon = self._soon(memory.seconds)
         risk, low, high = np.array([self._risk(n, soon) for n in counts]).T
         distances = np.array([outcome.left for outcome in outcomes])
         return Judgement(risk, low, high, distances, float(memory.number), situation.seen)
-
-    def _is_blind(self, z: Floats) -> bool:
-        """Whether it was not seen whole for long."""
-        return self._n_blind + 1 >= self.BLIND and is_missing(z)
-
-    def _is_beyond(self, z: Floats) -> bool:
-        """Whether it is far from all that was seen."""
-        least, most = self.usual
-        return bool(((z < least) | (z > most)).any())
-
-    @property
-    def usual(self) -> Floats:
-        """(2, m) what is beyond was never seen: half as far again as two episodes came."""
-        least, most = self.state.lowest[1], self.state.highest[1]
-        room = np.where(most >= least, 0.5 * (most - least), math.inf)
-        return np.array([np.minimum(least, most) - room, np.maximum(least, most) + room])
 
     def _soon(self, exposure: float) -> float:
         """The horizon, as a share of the time in which all that is remembered was seen."""

@@ -328,6 +328,7 @@ class Parts(NamedTuple):
     n_tried: int  #: and while a rival is tried, by which another may save
     n_judged: int  #: and those by which a risk is found
     most: float  #: steps of rollouts after which a search is cut short
+    usual: Floats  #: (2, m) beyond which nothing like it was seen
 
     @classmethod
     def of(cls, state: State, dt: float) -> Parts | None:
@@ -344,7 +345,10 @@ class Parts(NamedTuple):
         n_policies = len(state.policies)
         n_tried = few if not state.is_doubted or most < n_policies * state.horizon else n_policies
         scale = state.disturbance_scale
-        return cls(motion, daring_model, residuals, scale, few, n_tried, n_judged, most)
+        least, farthest = state.lowest[1], state.highest[1]  # if two episodes came there
+        room = np.where(farthest >= least, 0.5 * (farthest - least), np.inf)
+        usual = np.array([np.minimum(least, farthest) - room, np.maximum(least, farthest) + room])
+        return cls(motion, daring_model, residuals, scale, few, n_tried, n_judged, most, usual)
 
 
 # -- In a file -----------------------------------------------------------------------------------
