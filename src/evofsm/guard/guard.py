@@ -554,9 +554,7 @@ class Guard:
         if 0 < self._stale <= _STALE:
             return Intake.REPEATED if stands else Intake.LATE, z
         if self._stale == _STALE + 1:
-            clock = (
-                "stands still: nothing is seen" if stands else "was set back: it goes on from here"
-            )
+            clock = "stands still: nothing is seen" if stands else "was set back, and goes on so"
             warnings.warn(
                 f"times of {self._stale} observations on end were no later than {self._time:g} s, "
                 f"the time of the one before: the clock {clock}",
