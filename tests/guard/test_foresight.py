@@ -132,6 +132,7 @@ def test_where_nothing_foresees_a_failure_there_is_no_alarm_and_without_failures
         ({"episodes": [], "failed": []}, "of each of 0 episodes"),
         ({"dt": 0.0}, "dt is 0.0; it must be a positive"),
         ({"names": ["heat", "load"]}, "names are 2, of 1 variables"),
+        ({"units": ["°C", "kW"]}, "units are 2, of 1 variables"),
     ],
 )
 def test_what_it_cannot_learn_from_is_named(changed, fault):

@@ -233,8 +233,9 @@ class Foresight(LearningJudge):
         if not log.failed.any():
             raise ValueError("no episode failed, so there is nothing to foresee")
         refuse_unusable("observations", log.rows)
-        if len(names) not in (0, m := log.rows.shape[1]):
-            raise ValueError(f"names are {len(names)}, of {m} variables")
+        for name, texts in (("names", names), ("units", units)):
+            if len(texts) not in (0, m := log.rows.shape[1]):
+                raise ValueError(f"{name} are {len(texts)}, of {m} variables")
         labels = Labels(names=tuple(names), units=tuple(units))
         return cls._of_log(log, dt, horizon, 1 + round(hold / dt), labels)
 
