@@ -128,7 +128,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
     _fails_after: float  # steps after which what was refused fails, at the latest
     _unsurvived: int
     _n_blind: int  # observations on end, up to the latest one, that lack something
-    _first: Floats  # before one was whole: what was seen of each variable last
+    _first: Floats  # before one was whole: each variable as it was seen last
     _ranks: Ints  # of backups, those first that passed last
 
     def __init__(
@@ -397,7 +397,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         """The situation, if that is seen; what was not is taken to be as was expected."""
         row, m, stride = z, len(z), self.state.stride
         if not self._step:
-            row = self._merged(z)
+            row = np.where(np.isnan(z), self._first, z)
             return None if is_missing(row) else np.append(row, np.zeros(m + self.size))
         if is_missing(z):
             situation, action = self._step[-1]
@@ -408,10 +408,6 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         situations, actions = zip(*self._step, strict=True)
         change = (row - situations[0][:m]) * (stride / len(actions))
         return np.concatenate([row, change, sum(actions) / len(actions)])
-
-    def _merged(self, z: Floats) -> Floats:
-        """An observation, before one was whole: what is not seen as it was last."""
-        return np.where(np.isnan(z), self._first, z) if len(self._first) else z
 
     def _untried(self, best: Floats, mask: Mask | None) -> Floats | None:
         """An action whose effect is hardly known, if there is one."""
@@ -500,7 +496,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         here = self._here(z)
         self._n_blind = self._n_blind + 1 if is_missing(z) else 0
         if here is None:
-            self._first = self._merged(z)
+            self._first = np.where(np.isnan(z), self._first, z)
         else:
             self._step = [*self._step, (here, self.encode(action))][-self.state.stride :]
 
@@ -568,7 +564,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         self._step, self._z, self._u, self._notes = [], [], [], []
         self._certified = self._holds = self._refused = self._lost = False
         self._unsurvived, self._n_blind, self._fails_after = 0, 0, 0.0
-        self._first = np.empty(0)
+        self._first = np.array(math.nan)
         self._used, self._ranks = np.zeros((self.size, 2)), np.arange(len(self.state.policies))
 
     # -- For people, and in a file --------------------------------------------------------------
