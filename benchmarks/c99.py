@@ -445,10 +445,10 @@ def _learnt(guard: Guard, code: dict[str, int], number: dict[str, float]) -> str
     remembered, backup = judge.remembered, judge.backup_text(code["backup"])
     allowed = judge._allowed(reviser.tolerance, remembered)
     remembered = remembered._replace(spared=allowed)
-    alone = words.BY_MODEL if math.isnan(number["risk_proposed"]) else ""
+    doubt = words.BY_MODEL if math.isnan(number["risk_proposed"]) else ""
     if kind == 0:
-        return alone + words.kept(backup, remembered, number["left"])
-    why = alone + words.refused(
+        return doubt + words.kept(backup, remembered, number["left"])
+    why = doubt + words.refused(
         code["unsurvived"], remembered, judge.state.margin, judge.parts.scale
     )
     if kind == 1:

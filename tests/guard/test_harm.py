@@ -209,7 +209,7 @@ def test_frozen_it_acts_where_episodes_ended_better(guarded, alone, helps):
     [(18, 400, 0, 0), (8, 400, 0, 1), (8, 30, 0, 0), (8, 0, 0, 0), (4, 0, 0, 1), (2, 0, 12, 1)],
 )
 def test_frozen_it_acts_where_it_prevents_most_failures(failed, kept, alone, helps):
-    """Later crashes count for little; who flies by itself has to do more, but one may be chance."""
+    """Later crashes count for little; who flies by itself has to do more, but few are no matter."""
     guarded = [(150, "f", None) if failed * k % 20 < failed else (300, "", None) for k in range(20)]
     survived = [(110, "", None)] * alone
     harm = arms(guarded, [(110, "f", None)] * 6 + survived)._replace(decided=500.0, kept=kept)

@@ -29,11 +29,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.fsm.validation import Floats
 from evofsm.store import COUNT, Numbers
 
 # Episodes of each arm that are kept, the latest; what is left of the weight of one an episode
-# later, where who drives may be another one by then, and else; and the weights of those that ended
-# well, with which guarded and alone begin: who drives alone until the first refusal is known.
+# later, and where who drives may be another one by then; and the weights of those that ended well,
+# with which guarded and alone begin: who drives alone until the first refusal is known.
 _KEPT, _FADES, _HOPES = 20, (0.98, 0.9), (0.5, 0.25)
 # So many episodes after the latest of the controller alone one is drawn, and then as often.
 _RARELY = 10
@@ -138,11 +139,11 @@ class Harm(NamedTuple):
             return False
         if not guarded or not alone:
             return True
-        (g, rate), (a, rate_alone) = (self._record(arm, learning) for arm in (guarded, alone))
+        (g, share, rate), (a, _, rate_alone) = (self._record(o, learning) for o in (guarded, alone))
         change = 1.0 - self.kept / self.decided if self.decided >= _FEWEST_DECISIONS else 0.0
         most = _LEFT + (_LEFT_BY_ITSELF - _LEFT) * change
-        fails_much = learning or g @ [outcome.failed for outcome in guarded] > _FEW * g.sum()
-        if len(guarded) >= _CAREFUL and fails_much and rate > most * rate_alone:
+        is_asked = len(guarded) >= _CAREFUL and (learning or share > _FEW)
+        if is_asked and rate > most * rate_alone:
             return False
         if rate_alone and not learning:  # who survived alone had it easier: scores tell nothing
             guarded, alone = ([o._replace(score=math.nan) for o in arm] for arm in (guarded, alone))
@@ -166,17 +167,17 @@ class Harm(NamedTuple):
         won = np.einsum("ni,ij,nj->n", guarded, better(*arms), alone)
         return float((won >= 0.0).mean())
 
-    def _weights(self, outcomes: Sequence[Outcome], *, learning: bool) -> NDArray[np.float64]:
+    def _weights(self, outcomes: Sequence[Outcome], *, learning: bool) -> Floats:
         is_open = self.ends or any(o.failed for o in self.guarded[-_RARELY:])
-        changes = {True: not learning, False: learning and is_open}  # guarded, alone
-        fades = [_FADES[changes[o.guarded]] for o in outcomes]
+        guarded, alone = _FADES[not learning], _FADES[learning and is_open]
+        fades = [guarded if o.guarded else alone for o in outcomes]
         return np.power(fades, [self.n_episodes - o.episode for o in outcomes])
 
-    def _record(self, arm: Sequence[Outcome], learning: bool) -> tuple[NDArray[np.float64], float]:
-        """Weights of an arm, and its failures per step."""
+    def _record(self, arm: Sequence[Outcome], learning: bool) -> tuple[Floats, float, float]:
+        """Weights of an arm, which share of it failed, and its failures per step."""
         weights = self._weights(arm, learning=learning)
         fails, steps = weights @ [(o.failed, o.steps) for o in arm]
-        return weights, float(fails / steps)
+        return weights, float(fails / weights.sum()), float(fails / steps)
 
     def passing(self, *, learning: bool) -> str:
         """Why proposals pass in the episode to come; empty where they are revised."""
@@ -239,7 +240,7 @@ class Harm(NamedTuple):
         return cls(tuple(rows), **settings)
 
     @property
-    def rows(self) -> NDArray[np.float64]:
+    def rows(self) -> Floats:
         """(h, 7) outcomes, as a file holds them."""
         rows = np.array(self.outcomes, np.float64).reshape(-1, 6)
         return np.nan_to_num(np.insert(rows, 5, np.isfinite(rows[:, 5]), axis=1))
@@ -282,7 +283,7 @@ class Harm(NamedTuple):
         return now._replace(outcomes=(*(o for o in self.outcomes if o not in oldest), new))
 
 
-def better(some: Sequence[Outcome], others: Sequence[Outcome]) -> NDArray[np.float64]:
+def better(some: Sequence[Outcome], others: Sequence[Outcome]) -> Floats:
     """(s, o) 1 where one of ``some`` ended better than one of ``others``, -1 where worse; else 0.
 
     Where both failed it counts less.

@@ -116,10 +116,10 @@ def monitor(
     from evofsm.guard import Foresight, Guard
     from evofsm.io.tables import is_number
 
-    own_brakes = None if brakes == options.BRAKES else brakes
-    parts = {"low": low, "high": high, "n_actions": n_actions, "interval": interval}
-    parts |= {"brakes": own_brakes, "horizon": horizon, "persist": persist or None}
-    if guard is not None and (idle := [name for name, part in parts.items() if part is not None]):
+    acts = {"low": low, "high": high, "n_actions": n_actions}
+    choices: dict[str, Any] = {**acts, "interval": interval, "horizon": horizon}
+    choices |= {"persist": persist or None, "brakes": brakes if brakes != options.BRAKES else None}
+    if guard is not None and (idle := [name for name, part in choices.items() if part is not None]):
         name = idle[0].replace("_", "-")
         raise ValueError(f"--{name} is for a guard that is made here; {guard} has learnt its own")
     accepted_risk = options.TOLERANCE if tolerance is None else tolerance
@@ -132,7 +132,7 @@ def monitor(
             return new_guard
         return guard_of_monitor(interval or _INTERVAL, brakes, accepted_risk, traffic=traffic)
 
-    parts = {"low": low, "high": high, "n_actions": n_actions, "observe": observe}
+    parts = {**acts, "observe": observe}
     system, new_guard = {name: part for name, part in parts.items() if part is not None}, None
     if guard is None and not is_log and (system or "action" in reading):
         if traffic:

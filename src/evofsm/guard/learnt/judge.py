@@ -307,11 +307,11 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         self._lost = math.isinf(outcomes[-1].unsurvived)
         self._fails_after = max(self._fails_after, *(outcome.fails_after for outcome in outcomes))
         judgement = self._judged(situation, outcomes)
-        alone = words.BY_MODEL if math.isnan(judgement.risk[0]) else ""
+        doubt = words.BY_MODEL if math.isnan(judgement.risk[0]) else ""
         backup = self.backup_text(best, policies)
         if not self._refused:
-            return Search(options, judgement, 0, alone + words.kept(backup, memory, slack))
-        why = alone + words.refused(self._unsurvived, memory, margin, scale)
+            return Search(options, judgement, 0, doubt + words.kept(backup, memory, slack))
+        why = doubt + words.refused(self._unsurvived, memory, margin, scale)
         why += "" if mask is None else words.IF_NO_MORE
         if passes:
             instead = words.changed(backup, memory, margin)
@@ -605,8 +605,8 @@ class LearntRisk(ObservingJudge, SearchingJudge):
 
     @property
     def called(self) -> Sequence[str]:
-        """Names of variables, as people read them."""
-        return [Labels(names=self.labels.names).variable(j) for j in range(self.n_variables)]
+        """Names of variables; `words` makes them fit to be read."""
+        return self.labels.names or [f"variable {j + 1}" for j in range(self.n_variables)]
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write what was learnt to a file, with what it learnt from, for people (`provenance`)."""

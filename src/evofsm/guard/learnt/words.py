@@ -155,7 +155,9 @@ def experience(
     """What was learnt so far; what is said of failure where that is not known is ``nothing``."""
     there, ends, fatal_places = _where(state.forms, names)
     latest = {int(j): int(since) + 1 for j, since, _ in state.drifts}
-    more = "".join(f"; since episode {k} {names[j]} moves otherwise" for j, k in latest.items())
+    more = "".join(
+        f"; since episode {k} {in_a_line(names[j])} moves otherwise" for j, k in latest.items()
+    )
     if state.stride > 1:
         more += f"; it looks ahead in steps of {state.stride} decisions"
     if ends:
