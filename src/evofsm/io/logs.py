@@ -151,8 +151,9 @@ class Noted:
         self.failed += int(chunk.fails.sum())
         for row in chunk.observations[chunk.fails & chunk.begins].tolist():
             here = dict(zip(names, row, strict=True))
-            constants = self.at_once.items() & here.items() if self.failed_at_once else here
-            self.at_once, self.failed_at_once = dict(constants), self.failed_at_once + 1
+            before = self.at_once if self.failed_at_once else here
+            self.at_once = dict(pair for pair in before.items() if pair in here.items())
+            self.failed_at_once += 1
 
     def _compare_rates(self, chunk: Chunk, gap: int, follower: int, leader: int) -> None:
         """The gap changes as speeds differ, and the own speed as the action says."""
@@ -639,27 +640,23 @@ def open_table(path: str, columns: LogColumns, skips: Skips) -> Table:
 
         return BagTable(path, columns.topics, columns.observe.names, skips)
     if kind in ("osi", "mcap"):
-        read = vehicles.scenes_of_osi if kind == "osi" else vehicles.scenes_of_mcap
-        moments = vehicles.pairs_of_scenes(path, read(path, skips), skips)
-    elif kind == "xml":
-        steps = vehicles.fcd_of_xml(path, skips)
-        moments = vehicles.pairs_of_fcd(path, steps, columns.lengths, skips)
-    else:
-        log_names = {*columns.observe.names, columns.action, columns.time}
-        names = log_names.union(vehicles.OBJECT_COLUMNS, vehicles.FCD_COLUMNS)
-        of_parquet = kind == "parquet"
-        table: Table = (
-            tables.ParquetTable(path, skips) if of_parquet else tables.CsvTable(path, names, skips)
-        )
-        if {*columns.observe.names} <= {*table.columns}:
-            return table
-        if rows := vehicles.fcd_of_table(table):
-            moments = vehicles.pairs_of_fcd(path, rows, columns.lengths, skips)
-        elif {*vehicles.OBJECT_COLUMNS} <= {*table.columns}:
-            moments = vehicles.pairs_of_scenes(path, vehicles.scenes_of_table(table), skips)
-        else:
-            return table
-    return PairTable(path, moments, skips)
+        read = vehicles.objects_of_osi if kind == "osi" else vehicles.objects_of_mcap
+        return PairTable(path, read(path, skips), skips)
+    if kind == "xml":
+        return PairTable(path, vehicles.fcd_of_xml(path, skips), skips, columns.lengths)
+    log_names = {*columns.observe.names, columns.action, columns.time}
+    names = log_names.union(vehicles.OBJECT_COLUMNS, vehicles.FCD_COLUMNS)
+    of_parquet = kind == "parquet"
+    table: Table = (
+        tables.ParquetTable(path, skips) if of_parquet else tables.CsvTable(path, names, skips)
+    )
+    if {*columns.observe.names} <= {*table.columns}:
+        return table
+    if moments := vehicles.fcd_of_table(table):
+        return PairTable(path, moments, skips, columns.lengths)
+    if {*vehicles.OBJECT_COLUMNS} <= {*table.columns}:
+        return PairTable(path, vehicles.objects_of_table(table), skips)
+    return table
 
 
 def _columns_of_pairs(path: str, columns: LogColumns) -> LogColumns:

@@ -14,7 +14,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import chain
+from itertools import chain, islice
 from typing import Any, NamedTuple, NoReturn
 from xml.parsers import expat
 
@@ -32,26 +32,41 @@ COLUMNS = ("time", *VARIABLES, ACTION)  #: what is known of a pair at one time
 _ROWS_AT_ONCE = 8192
 # Rows that may wait before all are handed on, of 32 bytes each; a pair that is cut loses one step.
 _MOST_WAITING = 1_000_000
-_MOST_ON_A_LANE = 1000  # more at one time are no recording of a road, and fill the memory
+_MOST_ON_A_LANE = 1000  # more at one time are no recording of a road, and take long
+
+# What is said where nothing is on a lane.
+_NO_CAR = (
+    " holds no vehicle on a lane (an empty simulation, persons only, or --fcd-output.attributes "
+    "without lane?)"
+)
+_NO_OBJECT = (
+    ": no object is on a lane, and who follows whom is told by lanes (recorded without a map? "
+    "assign the lanes first)"
+)
 
 Place = Callable[[], str]  #: says where something stands, for a message
 
 
-class Following(NamedTuple):
-    """A vehicle and the one that it follows, at one time."""
+class Vehicle(NamedTuple):
+    """Where a vehicle is at one time, and how it moves."""
 
-    who: tuple[str, str, str]  #: lane, follower, leader
-    gap: float  #: bumper to bumper [m]
-    v_follower: float  #: [m/s]
-    v_leader: float  #: [m/s]
+    where: Place
+    lane: str
+    name: str
+    place: complex  #: in the plane [m]; NaN if not told
+    heading: complex  #: of length 1; NaN if not told
+    speed: float  #: [m/s]
+    front: float  #: from its place to its front bumper [m]
+    rear: float  #: and to the rear one
+    width: float  #: [m]
+    along: float = math.nan  #: its place along the lane [m], if told; else it is where it points
+    lateral: float = math.nan  #: its place across the lane [m], if told
+    kind: str = ""
 
 
-class Moment(NamedTuple):
-    """All pairs that there are at one time."""
-
-    time: float  #: [s]
-    place: Place
-    pairs: Sequence[Following]
+#: Time [s], where it stands, and all that is there then: where, and what stands there by its name.
+Moment = tuple[float, Place, list[tuple[Place, Mapping[str, Any]]]]
+_Pair = tuple[str, str, str]  #: lane, follower and leader
 
 
 class PairTable(Table):
@@ -60,9 +75,14 @@ class PairTable(Table):
     columns = COLUMNS
     derives = True
 
-    def __init__(self, path: str, moments: Iterable[Moment], skips: Skips) -> None:
-        self.path, self.skips = path, skips
-        self._moments = moments
+    def __init__(
+        self,
+        path: str,
+        moments: Iterable[Moment],
+        skips: Skips,
+        lengths: VehicleLengths | None = None,  # of FCD
+    ) -> None:
+        self.path, self.skips, self._moments, self._lengths = path, skips, moments, lengths
 
     def pieces(self, wanted: Wanted) -> Iterator[Piece]:
         """All columns, whichever are wanted."""
@@ -82,30 +102,104 @@ class PairTable(Table):
                 f"{self.path}: no vehicle ever follows another one on the same lane"
             )
 
-    def _episodes(self) -> Iterator[tuple[tuple[str, str, str], array[float] | None]]:
+    def _episodes(self) -> Iterator[tuple[_Pair, array[float] | None]]:
         """Rows of a pair for as long as it stays one, or until too many wait."""
-        open_pairs: dict[tuple[str, str, str], array[float]] = {}
-        before = -math.inf
-        for moment in self._moments:
-            if not moment.time > before:
+        open_pairs: dict[_Pair, array[float]] = {}
+        vehicle_of = _object if self._lengths is None else partial(_car, self._lengths)
+        before, headings, has_lanes = -math.inf, dict[str, complex](), False
+        for time, where, entries in self._moments:
+            try:  # persons, and vehicles off the road, have no lane
+                cars = [vehicle_of(*entry) for entry in entries if entry[1].get("lane")]
+            except ValueError as error:  # without one of them, others would be taken for pairs
+                self.skips.leave_out("timestep", str(error))
+                continue
+            has_lanes = has_lanes or bool(cars)
+            lanes = self._lanes(time, cars, headings)
+            if not time > before:
                 self.skips.leave_out(
                     "time",
-                    f"{moment.place()}: time goes from {before:g} to {moment.time:g}; it must run "
+                    f"{where()}: time goes from {before:g} to {time:g}; it must run "
                     "forward (rows not sorted by time, or two recordings in one file?)",
                 )
                 continue
-            before = moment.time
-            present: dict[tuple[str, str, str], array[float]] = {}
-            for pair in moment.pairs:
-                rows = open_pairs.pop(pair.who, None) or array("d")
-                rows.extend((moment.time, pair.gap, pair.v_follower, pair.v_leader))
-                present[pair.who] = rows
+            before = time
+            present: dict[_Pair, array[float]] = {}
+            for pair, numbers in chain.from_iterable(map(self._pairs, lanes)):
+                rows = open_pairs.pop(pair, None) or array("d")
+                rows.extend((time, *numbers))
+                present[pair] = rows
             yield from open_pairs.items()  # who has parted
             open_pairs = present
             if sum(map(len, present.values())) > 4 * _MOST_WAITING:
                 yield from open_pairs.items()
                 open_pairs = {}
         yield from open_pairs.items()
+        if not has_lanes:
+            self.skips.refuse_nothing(
+                self.path + (_NO_OBJECT if self._lengths is None else _NO_CAR)
+            )
+
+    def _lanes(
+        self, time: float, cars: Iterable[Vehicle], headings: dict[str, complex]
+    ) -> Iterable[list[Vehicle]]:
+        """Who is on each lane, once; who does not say where it points does so as before."""
+        lanes: defaultdict[str, list[Vehicle]] = defaultdict(list)
+        names = set[str]()
+        for car in cars:
+            if car.name in names:
+                fault = f"{car.name[:40]!r} is there twice at {time:g} s"
+                why = f"{car.where()}: {fault} (several recordings in one file?)"
+                self.skips.leave_out("twice", why)
+                continue
+            names.add(car.name)
+            if car.heading != car.heading:
+                car = car._replace(heading=headings.get(car.name, car.heading))
+            headings[car.name] = car.heading
+            lanes[car.lane].append(car)
+        return [lanes[name] for name in (sorted(lanes) if self._lengths else lanes)]
+
+    def _pairs(self, lane: list[Vehicle]) -> Iterator[tuple[_Pair, tuple[float, float, float]]]:
+        """Each vehicle of a lane and the nearest one ahead, not beside its way nor towards it.
+
+        With it come the gap, bumper to bumper [m], and both speeds [m/s].
+        """
+        lane.sort(key=lambda car: (car.along, car.name))
+        places = np.array([car.place for car in lane])
+        for order, car in enumerate(lane):
+            for leader, along, distance in _ahead(car, lane, order, places):
+                is_told = leader.heading == leader.heading
+                headings = car.heading + (leader.heading if is_told else car.heading)
+                aside = abs(leader.lateral - car.lateral)
+                if aside != aside and along < _BESIDE_WITHIN:  # across the way, as both point
+                    aside = abs(((leader.place - car.place) * headings.conjugate()).imag)
+                    aside /= abs(headings) + 1e-9
+                is_oncoming = abs(headings) < 1.0
+                if not (is_oncoming or aside >= 0.5 * (car.width + leader.width)):
+                    gap = distance - (car.front + leader.rear)
+                    if self._lengths and gap <= 0.0 and aside > _IN_LINE:
+                        self._lengths.overlaps[leader.kind] += 1
+                    yield (car.lane, car.name, leader.name), (gap, car.speed, leader.speed)
+                    break
+
+
+def _ahead(
+    car: Vehicle, lane: Sequence[Vehicle], order: int, places: NDArray[np.complex128]
+) -> Iterator[tuple[Vehicle, float, float]]:
+    """Who is ahead, the nearest one first: how far along the way, and away."""
+    if car.along == car.along:
+        for leader in islice(lane, order + 1, None):
+            yield leader, leader.along - car.along, leader.along - car.along
+        return
+    if len(lane) > _MOST_ON_A_LANE:
+        raise ValueError(
+            f"{car.where()}: {len(lane):,} objects on the lane {car.lane[:40]!r} at one time "
+            "(rows not sorted by time, or the clock of a coarse step?)"
+        )
+    apart = places - car.place
+    along, distances = (apart * car.heading.conjugate()).real, np.abs(apart)
+    for place in np.argsort(distances).tolist():
+        if along[place] > 0.0:
+            yield lane[place], float(along[place]), float(distances[place])
 
 
 def _with_actions(rows: array[float]) -> NDArray[np.float64]:
@@ -171,48 +265,7 @@ class VehicleLengths:
         return ", ".join([*texts, f"{'others ' if texts else ''}{self.lengths['']:g} m"])
 
 
-class _Car(NamedTuple):
-    lane: str
-    along: float  #: of the front bumper, along the lane [m]
-    name: str
-    speed: float  #: [m/s]
-    kind: str
-    length: float  #: [m]
-    width: float  #: [m]
-    #: Where it is across its lane [m], in the plane [m], and where it points; NaN if not told.
-    lateral: float
-    place: complex
-    heading: complex
-
-
-# Time [s], where it stands, and all that is there then: where, and what stands there by its name.
-_Timestep = tuple[float, Place, list[tuple[Place, Mapping[str, str]]]]
-
-
-def pairs_of_fcd(
-    path: str, steps: Iterable[_Timestep], lengths: VehicleLengths, skips: Skips
-) -> Iterator[Moment]:
-    """At each time, the vehicles of which one follows the other."""
-    has_vehicles = False
-    for time, place, entries in steps:
-        cars = dict[str, _Car]()
-        with skips.leaving_out("timestep"):  # without one of them, others would be taken for pairs
-            for where, attributes in entries:
-                if attributes.get("lane"):  # persons, and vehicles off the road, have none
-                    car = _car(where, attributes, lengths)
-                    if car.name in cars:
-                        skips.leave_out("twice", f"{where()}: {car.name[:40]!r} is there twice")
-                    cars.setdefault(car.name, car)
-            has_vehicles = has_vehicles or bool(cars)
-            yield Moment(time, place, list(_queues(sorted(cars.values()), lengths)))
-    if not has_vehicles:
-        skips.refuse_nothing(
-            f"{path} holds no vehicle on a lane (an empty simulation, persons only, or "
-            "--fcd-output.attributes without lane?)"
-        )
-
-
-def _car(place: Place, told: Mapping[str, str], lengths: VehicleLengths) -> _Car:
+def _car(lengths: VehicleLengths, place: Place, told: Mapping[str, str]) -> Vehicle:
     along, speed = (_number(place, name, told.get(name)) for name in ("pos", "speed"))
     x, y, angle, lateral = (
         _number(place, name, told[name]) if told.get(name) else math.nan
@@ -221,39 +274,18 @@ def _car(place: Place, told: Mapping[str, str], lengths: VehicleLengths) -> _Car
     if "id" not in told:
         _refuse_lack(place(), "id")
     kind, heading = told.get("type", ""), cmath.rect(1.0, math.radians(90.0 - angle))
-    fields = told["lane"], along, told["id"], speed, kind, *lengths.size_of(kind)
-    return _Car(*fields, lateral, complex(x, y), heading)
+    length, width = lengths.size_of(kind)
+    sizes = 0.0, length, width  # its place is that of the front bumper
+    fields = told["lane"], told["id"], complex(x, y), heading, speed, *sizes, along, lateral, kind
+    return Vehicle(place, *fields)
 
 
-def _queues(cars: Sequence[_Car], lengths: VehicleLengths) -> Iterator[Following]:
-    """Each vehicle and the next one ahead on its lane, not beside its way nor towards it."""
-    for place, car in enumerate(cars):
-        for leader in cars[place + 1 :]:
-            if leader.lane != car.lane:
-                break
-            aside = abs(leader.lateral - car.lateral)
-            if aside != aside and leader.along - car.along < _BESIDE_WITHIN:
-                aside = float(_across(leader.place - car.place, car.heading + leader.heading))
-            is_oncoming = abs(car.heading + leader.heading) < 1.0
-            if not (is_oncoming or aside >= 0.5 * (car.width + leader.width)):
-                gap = leader.along - leader.length - car.along
-                if gap <= 0.0 and aside > _IN_LINE:
-                    lengths.overlaps[leader.kind] += 1
-                yield Following((car.lane, car.name, leader.name), gap, car.speed, leader.speed)
-                break
-
-
-def _across(apart: Any, headings: Any) -> Any:
-    """How far apart two are across the way, in the complex plane, by the sum of their headings."""
-    return abs((apart * headings.conjugate()).imag) / (abs(headings) + 1e-9)
-
-
-def fcd_of_xml(path: str, skips: Skips) -> Iterator[_Timestep]:
+def fcd_of_xml(path: str, skips: Skips) -> Iterator[Moment]:
     """Read FCD in XML, with a parser that keeps nothing and knows its line."""
     # Told the encoding, it asks no codec for the one that a file names: SUMO writes UTF-8.
     parser = expat.ParserCreate("utf-8")
-    step: _Timestep = math.nan, str, []
-    depth, whole = 0, list[_Timestep]()
+    step: Moment = math.nan, str, []
+    depth, whole = 0, list[Moment]()
 
     def refuse(why: str) -> NoReturn:
         raise ValueError(
@@ -308,7 +340,7 @@ def fcd_of_xml(path: str, skips: Skips) -> Iterator[_Timestep]:
             whole.clear()
 
 
-def fcd_of_table(table: Table) -> Iterator[_Timestep] | None:
+def fcd_of_table(table: Table) -> Iterator[Moment] | None:
     """Read FCD in CSV or Parquet, rows of a time together; None of another table.
 
     SUMO names columns after what it writes first, be it a person; or by --output.column-header.
@@ -328,16 +360,13 @@ def fcd_of_table(table: Table) -> Iterator[_Timestep] | None:
             _refuse_lack(table.path, name)
     optional = [f"{prefix}{name}" for name in ("type", "posLat", "x", "y", "angle")]
     names = [*needed, *(name for name in optional if name in columns)]
-    plain = [name.removeprefix(prefix) for name in names]
-    return (
-        (at, rows[0][0], [(place, dict(zip(plain, row, strict=True))) for place, *row in rows])
-        for at, rows in _by_time(table, Wanted([time], names))
-    )
+    return _by_time(table, Wanted([time], names), prefix)
 
 
-def _by_time(table: Table, wanted: Wanted) -> Iterator[tuple[float, list[tuple[Any, ...]]]]:
-    """Place, numbers and texts of all rows of a time, unless one is left out."""
-    now, rows, is_whole = math.nan, list[tuple[Any, ...]](), True
+def _by_time(table: Table, wanted: Wanted, prefix: str = "") -> Iterator[Moment]:
+    """All rows of a time, unless one is left out."""
+    now, rows, is_whole = math.nan, list[tuple[Place, Mapping[str, Any]]](), True
+    names = [name.removeprefix(prefix) for name in (*wanted.numbers[1:], *wanted.texts)]
     for piece in table.pieces(wanted):
         piece.leave_out_unusable(wanted.numbers[0])
         columns = [piece.numbers[name].tolist() for name in wanted.numbers]
@@ -349,13 +378,13 @@ def _by_time(table: Table, wanted: Wanted) -> Iterator[tuple[float, list[tuple[A
             is_whole = is_whole and row not in breaks
             if time != now:
                 if rows and is_whole:
-                    yield now, rows
+                    yield now, rows[0][0], rows
                 now, rows, is_whole = time, [], row not in breaks
             is_whole = is_whole and row not in bad
-            rows.append((partial(piece.at, row), *values))
+            rows.append((partial(piece.at, row), dict(zip(names, values, strict=True))))
         is_whole = is_whole and piece.rows not in breaks
     if rows and is_whole:
-        yield now, rows
+        yield now, rows[0][0], rows
 
 
 def _number(place: Place, name: str, text: str | None) -> float:
@@ -387,119 +416,28 @@ OBJECT_COLUMNS = ("id", "t", "x", "y", "vx", "vy", "length", "lane")
 _TURNS_ABOVE = 0.1  # whoever is slower [m/s] points where it pointed before
 
 
-class Object(NamedTuple):
-    """A vehicle at one time."""
-
-    id: str
-    lane: str
-    x: float  #: of the middle of its box [m]
-    y: float  #: [m]
-    vx: float  #: [m/s]
-    vy: float  #: [m/s]
-    length: float  #: [m]
-    #: Where it points, from the x axis [rad]; where it is NaN, it points where it moves or, where
-    #: it stands, where it moved last.
-    heading: float = math.nan
-    width: float = math.nan  #: [m], where it is known
-
-    def refuse_unfit(self, place: Place) -> None:
-        """Raise where it has no length, or lacks a number."""
-        numbers = self.x, self.y, self.vx, self.vy, self.length
-        if not (all(abs(x) <= LARGEST_OBSERVATION for x in numbers) and self.length > 0.0):
-            raise ValueError(
-                f"{place()}: object {self.id[:40]} is {self.length:g} m long, at ({self.x:g}, "
-                f"{self.y:g}) m, with ({self.vx:g}, {self.vy:g}) m/s; it needs a length and numbers"
-            )
-
-
-class Scene(NamedTuple):
-    """All objects at one time."""
-
-    time: float  #: [s]
-    place: Place
-    objects: list[Object]
-
-
-def scenes_of_table(table: Table) -> Iterator[Scene]:
+def objects_of_table(table: Table) -> Iterator[Moment]:
     """Read a table of objects, whose rows of one time stand together."""
     optional = [name for name in ("heading", "width") if name in table.columns]
-    numbers = ["x", "y", "vx", "vy", "length"]
-    for time, rows in _by_time(table, Wanted(["t", *numbers, *optional], ["id", "lane"])):
-        with table.skips.leaving_out("scene"):
-            objects = []
-            for place, *values, name, lane in rows:
-                if not lane:  # whoever follows nobody may lack anything
-                    continue
-                fields = dict(zip([*numbers, *optional], values, strict=True))
-                objects.append(Object(name, lane, **fields))
-                objects[-1].refuse_unfit(place)
-            yield Scene(time, rows[0][0], objects)
+    numbers = ["t", "x", "y", "vx", "vy", "length", *optional]
+    return _by_time(table, Wanted(numbers, ["id", "lane"]))
 
 
-def pairs_of_scenes(path: str, scenes: Iterable[Scene], skips: Skips) -> Iterator[Moment]:
-    """At each time, each vehicle and the nearest one ahead of it on its lane, or nearly beside it.
-
-    The gap is the distance between the middles, in a straight line, less half of both lengths:
-    where a lane bends, it is a little too small.
-    """
-    headings: dict[str, float] = {}
-    has_lanes = False
-    for scene in scenes:
-        lanes: defaultdict[str, list[Object]] = defaultdict(list)
-        names = set[str]()
-        for obj in scene.objects:
-            if obj.id in names:
-                skips.leave_out(
-                    "twice",
-                    f"{scene.place()}: {obj.id[:40]!r} is there twice at {scene.time:g} s (several "
-                    "recordings in one file?)",
-                )
-                continue
-            names.add(obj.id)
-            heading = obj.heading
-            if not math.isfinite(heading):
-                moves = math.hypot(obj.vx, obj.vy) >= _TURNS_ABOVE
-                heading = math.atan2(obj.vy, obj.vx) if moves else headings.get(obj.id, math.nan)
-            headings[obj.id] = heading
-            lanes[obj.lane].append(obj._replace(heading=heading))
-        has_lanes = has_lanes or bool(lanes)
-        pairs = [pair for lane in lanes.values() for pair in _following(scene, lane)]
-        yield Moment(scene.time, scene.place, pairs)
-    if not has_lanes:
-        skips.refuse_nothing(
-            f"{path}: no object is on a lane, and who follows whom is told by lanes (recorded "
-            "without a map? assign the lanes first)"
-        )
-
-
-def _following(scene: Scene, lane: Sequence[Object]) -> Iterator[Following]:
-    if len(lane) > _MOST_ON_A_LANE:
+def _object(place: Place, told: Mapping[str, Any]) -> Vehicle:
+    """One whose heading, where nobody tells it, is the way that it moves; else not known."""
+    numbers = x, y, vx, vy, length = [told[name] for name in ("x", "y", "vx", "vy", "length")]
+    name, heading, width = told["id"], told.get("heading", math.nan), told.get("width", math.nan)
+    if not (all(abs(number) <= LARGEST_OBSERVATION for number in numbers) and length > 0.0):
         raise ValueError(
-            f"{scene.place()}: {len(lane):,} objects on the lane {lane[0].lane[:40]!r} at one time "
-            "(rows not sorted by time, or the clock of a coarse step?)"
+            f"{place()}: object {name[:40]} is {length:g} m long, at ({x:g}, {y:g}) m, with "
+            f"({vx:g}, {vy:g}) m/s; it needs a length and numbers"
         )
-    if len(lane) == 1:
-        return
-    x, y, headings = np.array([(obj.x, obj.y, obj.heading) for obj in lane]).T
-    dx, dy = x[None, :] - x[:, None], y[None, :] - y[:, None]
-    along = dx * np.cos(headings)[:, None] + dy * np.sin(headings)[:, None]
-    widths = np.array([obj.width for obj in lane])
-    widths[~(widths > 0.0)] = _USUAL_WIDTH
-    leader_headings = np.where(np.isnan(headings), headings[:, None], headings)
-    mean = np.exp(1j * headings[:, None]) + np.exp(1j * leader_headings)
-    beside = _across(dx + 1j * dy, mean) >= 0.5 * (widths[:, None] + widths)
-    left_out = (beside & (along < _BESIDE_WITHIN)) | (abs(mean) < 1.0)  # or oncoming
-    ahead = (along > 0.0) & ~left_out
-    apart = np.where(ahead, np.hypot(dx, dy), np.inf)
-    for follower, nearest, distance in zip(lane, apart.argmin(1), apart.min(1), strict=True):
-        leader = lane[int(nearest)]
-        if np.isfinite(distance):
-            yield Following(
-                (follower.lane, follower.id, leader.id),
-                float(distance) - 0.5 * (follower.length + leader.length),
-                math.hypot(follower.vx, follower.vy),
-                math.hypot(leader.vx, leader.vy),
-            )
+    speed, half = math.hypot(vx, vy), 0.5 * length
+    if not math.isfinite(heading):
+        heading = math.atan2(vy, vx) if speed >= _TURNS_ABOVE else math.nan
+    width = width if width > 0.0 else _USUAL_WIDTH
+    ahead = cmath.rect(1.0, heading)
+    return Vehicle(place, told["lane"], name, complex(x, y), ahead, speed, half, half, width)
 
 
 # -- ASAM OSI -------------------------------------------------------------------------------------
@@ -508,8 +446,8 @@ _MOST_BYTES = 1 << 28  # of a message; one of a sensor with images has a few mil
 _LENGTH = struct.Struct("<I")
 
 
-def scenes_of_osi(path: str, skips: Skips) -> Iterator[Scene]:
-    """Read ground truth, or that within sensor views, from a ``.osi`` file, scene by scene."""
+def objects_of_osi(path: str, skips: Skips) -> Iterator[Moment]:
+    """Read ground truth, or that within sensor views, from a ``.osi`` file, one by one."""
     osi = _osi(path)
     with Source(path, skips) as source:
         is_view, number = False, 0
@@ -529,10 +467,10 @@ def scenes_of_osi(path: str, skips: Skips) -> Iterator[Scene]:
             if number == 1:
                 is_view = _is_view(osi, data)
             with skips.leaving_out("message"):
-                yield _scene(osi, f"{path}, message {number}", data, is_view)
+                yield _moment(osi, f"{path}, message {number}", data, is_view)
 
 
-def scenes_of_mcap(path: str, skips: Skips) -> Iterator[Scene]:
+def objects_of_mcap(path: str, skips: Skips) -> Iterator[Moment]:
     """Read OSI in MCAP: the first channel of ground truth or of sensor views."""
     osi = _osi(path)
     channel_id, number, kinds = None, 0, set[str]()
@@ -545,7 +483,7 @@ def scenes_of_mcap(path: str, skips: Skips) -> Iterator[Scene]:
             number += 1
             skips.on_read(len(message.data))
             with skips.leaving_out("message"):
-                yield _scene(osi, f"{path}, message {number}", message.data, kind == "SensorView")
+                yield _moment(osi, f"{path}, message {number}", message.data, kind == "SensorView")
     if channel_id is None:
         names = ", ".join(sorted(kinds - {""})) or "none"
         skips.refuse_nothing(
@@ -569,7 +507,7 @@ def _is_view(osi: Any, data: bytes) -> bool:
         return False
 
 
-def _scene(osi: Any, place: str, data: bytes, is_view: bool) -> Scene:
+def _moment(osi: Any, place: str, data: bytes, is_view: bool) -> Moment:
     try:
         message = (osi.SensorView if is_view else osi.GroundTruth).from_binary(data)
     except ValueError as error:
@@ -580,31 +518,30 @@ def _scene(osi: Any, place: str, data: bytes, is_view: bool) -> Scene:
     truth = message.global_ground_truth if is_view else message
     stamp = (truth and truth.timestamp) or message.timestamp or osi.Timestamp()
     on_foot = (osi.MovingObject.Type.PEDESTRIAN, osi.MovingObject.Type.ANIMAL)
-    objects = [
-        _object(place, vehicle, lane)
+    entries: list[tuple[Place, Mapping[str, Any]]] = [
+        (lambda: place, _row_of(vehicle))
         for vehicle in (truth.moving_object if truth else ())
-        if vehicle.base and vehicle.type not in on_foot and (lane := _lane(vehicle))
+        if vehicle.base and vehicle.type not in on_foot
     ]
-    return Scene(stamp.seconds + 1e-9 * stamp.nanos, lambda: place, objects)
+    return stamp.seconds + 1e-9 * stamp.nanos, lambda: place, entries
 
 
-def _lane(moving: Any) -> str:
+def _lane(vehicle: Any) -> str:
     """Where it is; empty where that is not known: it follows nobody, and nobody follows it."""
-    classification = moving.moving_object_classification
-    lanes = (classification and classification.assigned_lane_id) or moving.assigned_lane_id
+    classification = vehicle.moving_object_classification
+    lanes = (classification and classification.assigned_lane_id) or vehicle.assigned_lane_id
     if lanes or not (classification and classification.logical_lane_assignment):
         return str(lanes[0].value) if lanes else ""
     return f"logical {classification.logical_lane_assignment[0].assigned_lane_id.value}"
 
 
-def _object(place: str, moving: Any, lane: str) -> Object:
-    base = moving.base
-    name = str(moving.id.value) if moving.id else "without an id"
-    x, y = (base.position.x, base.position.y) if base.position else (math.nan, math.nan)
-    vx, vy = (base.velocity.x, base.velocity.y) if base.velocity else (math.nan, math.nan)
-    length = base.dimension.length if base.dimension else math.nan
+def _row_of(vehicle: Any) -> dict[str, Any]:
+    """The same as a row of a table of objects."""
+    base, size, unknown = vehicle.base, vehicle.base.dimension, (math.nan, math.nan)
+    x, y = (base.position.x, base.position.y) if base.position else unknown
+    vx, vy = (base.velocity.x, base.velocity.y) if base.velocity else unknown
+    length, width = (size.length, size.width) if size else unknown
     heading = base.orientation.yaw if base.orientation else math.nan
-    width = base.dimension.width if base.dimension else math.nan
-    obj = Object(name, lane, x, y, vx, vy, length, heading, width or math.nan)
-    obj.refuse_unfit(lambda: place)
-    return obj
+    name = str(vehicle.id.value) if vehicle.id else "without an id"
+    row = {"id": name, "lane": _lane(vehicle), "x": x, "y": y, "vx": vx, "vy": vy}
+    return row | {"length": length, "width": width, "heading": heading}
