@@ -325,9 +325,9 @@ def test_without_a_clock_a_row_that_is_left_out_ends_an_episode(tmp_path):
 
 
 def test_a_failure_at_a_time_that_is_there_twice_is_one(tmp_path):
-    rows = [*short([3, 2, 1]), "p,0.2,0,10,11,-0.5,1"]
+    rows = [*short([3, 2, 1]), "p,0.2,0,10,11,-0.5,1", "p,0.3,9,10,11,-0.5,0"]
     path = write(tmp_path / "a.csv", rows, SHORT)
-    assert together(path, failed="crash") == ([3, 2, 1], [0], [2])
+    assert together(path, failed="crash") == ([3, 2, 1, 9], [0, 3], [2])
 
 
 def test_a_missing_action_is_counted_where_another_row_follows(tmp_path, pieces):

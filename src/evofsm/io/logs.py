@@ -70,7 +70,8 @@ _OUTSIDE = r"""(?=(?:[^"']|"[^"]*"|'[^']*')*$)"""
 _OR, _AND = (re.compile(rf"\s+{word}\s+{_OUTSIDE}") for word in ("or", "and"))
 _SIGNS = {"<=": operator.le, ">=": operator.ge, "<": operator.lt, ">": operator.gt}
 _SIGNS |= {"==": operator.eq, "!=": operator.ne}
-_TRUTHS = {"true": 1, "yes": 1, "1": 1, "1.0": 1, "false": 0, "no": 0, "0": 0, "0.0": 0}
+_TRUTHS = dict.fromkeys(("true", "yes", "1", "1.0"), True)
+_TRUTHS |= dict.fromkeys(("false", "no", "0", "0.0"), False)
 
 
 class Chunk(NamedTuple):
@@ -234,7 +235,7 @@ class Term(NamedTuple):
                 f"needed, or a comparison such as '{self.column}>0' or \"{self.column}=='on'\"",
             )
         kinds = texts.unique().to_list()
-        return texts.is_in([kind for kind in kinds if self.holds_of(kind)]).to_numpy()
+        return texts.is_in([kind for kind in kinds if self.truth_of(kind)]).to_numpy()
 
     def may_end(self, piece: Piece) -> bool:
         """Whether it holds in the last row, perhaps, only as a number was cut off there."""
@@ -247,26 +248,21 @@ class Term(NamedTuple):
 
     def fault(self, value: Any) -> str:
         """Why it cannot be told of one value, if that is so."""
-        if value is None or value == "":
+        if value is None or value == "" or self.truth_of(value) is not None:
             return ""
-        if self.sign:
-            kind = "number" if self.of_number else "text"
-            is_right = isinstance(value, str) != self.of_number
-            needs = f"it is compared with the {kind} {self.value!r}"
-        else:
-            is_right = str(value).strip().lower() in _TRUTHS
-            needs = "it must be a truth value: true and false, 1 and 0, yes and no"
-        return "" if is_right else f"is {value!r}; {needs}"
+        if not self.sign:
+            return f"is {value!r}; it must be a truth value: true and false, 1 and 0, yes and no"
+        kind = "number" if self.of_number else "text"
+        return f"is {value!r}; it is compared with the {kind} {self.value!r}"
 
-    def holds_of(self, value: Any) -> bool:
-        """Whether it holds of one value, a number, a text, a truth value or None."""
+    def truth_of(self, value: Any) -> bool | None:
+        """Whether it holds of one value; None of nothing, and of what it cannot be told of."""
         value = value.strip() if isinstance(value, str) else value
-        if value in (None, ""):
-            return False
-        if self.sign:
-            is_alike = isinstance(value, str) != self.of_number
-            return is_alike and bool(_SIGNS[self.sign](value, self.value))
-        return _TRUTHS.get(str(value).strip().lower()) == 1
+        if not self.sign:
+            return _TRUTHS.get(str(value).lower())
+        if value in (None, "") or isinstance(value, str) == self.of_number:
+            return None
+        return bool(_SIGNS[self.sign](value, self.value))
 
 
 class Condition(NamedTuple):
@@ -298,7 +294,7 @@ class Condition(NamedTuple):
 
     def holds_of(self, row: Mapping[str, Any]) -> bool:
         """Whether it holds of one row, of values by column."""
-        return any(all(t.holds_of(row.get(t.column)) for t in terms) for terms in self.either)
+        return any(all(t.truth_of(row.get(t.column)) for t in terms) for terms in self.either)
 
 
 class Resample(NamedTuple):
@@ -640,8 +636,7 @@ def open_table(path: str, columns: LogColumns, skips: Skips) -> Table:
 
         return BagTable(path, columns.topics, columns.observe.names, skips)
     if kind in ("osi", "mcap"):
-        read = vehicles.objects_of_osi if kind == "osi" else vehicles.objects_of_mcap
-        return PairTable(path, read(path, skips), skips)
+        return PairTable(path, vehicles.objects_of_osi(path, skips), skips)
     if kind == "xml":
         return PairTable(path, vehicles.fcd_of_xml(path, skips), skips, columns.lengths)
     log_names = {*columns.observe.names, columns.action, columns.time}
@@ -802,7 +797,7 @@ class _Reader:
             for name, factor in factors.items():
                 piece.numbers[name] = piece.numbers[name] * factor
             if clock.ticks and not request.dates:
-                piece.leave_out_unusable(self._columns.time)
+                piece.leave_out(self._columns.time, piece.unusable(self._columns.time))
             times = self._times(piece, is_date=bool(request.dates))
             if clock.ticks and (action_rows := self._fill(piece, times)) is not None:
                 piece, times = piece.take(action_rows), times[action_rows]
@@ -1005,12 +1000,13 @@ class _Reader:
         is_left_out = is_incomplete | elsewhere
         cars = VARIABLES if self._observed == [*VARIABLES] else ()
         for name in self._observed:
-            piece.leave_out_unusable(name, ~is_left_out, _NO_LEADER if cars else _MISSING)
+            hint = _NO_LEADER if cars else _MISSING
+            piece.leave_out(name, piece.unusable(name) & ~is_left_out, hint=hint)
         for name, span in zip(cars, RANGES, strict=False):
             why = f"{_NO_CAR}it lies between {span[0]:g} and {span[1]:g}"
-            piece.leave_out_unusable(name, ~is_left_out, "", span, why)
+            piece.leave_out(name, piece.unusable(name, *span) & ~is_left_out, why)
         unknown = np.isnan(piece.numbers[action])
-        piece.leave_out_unusable(action, ~is_left_out & ~unknown)
+        piece.leave_out(action, piece.unusable(action) & ~is_left_out & ~unknown)
         if not (self._table.derives or columns.resample or action in self._observed):
             self._count_unknown(piece, unknown & ~is_left_out, starts)
         for term in failed.terms if failed else ():
@@ -1047,7 +1043,9 @@ class _Reader:
             elsewhere |= is_incomplete
         if not columns.longest_hole:
             elsewhere |= piece.bad
-        ends = (fails | still | elsewhere) & ~late
+        ends = fails | still | elsewhere
+        for row in np.flatnonzero(late):  # which ends none, nor hides that one ended
+            ends[row] = ends[row - 1] if row else self._ended
         starts |= np.append(self._ended, ends[:-1])
         self._ended, self._kept = bool(ends[-1]), bool(is_kept[-1])
         return is_kept, fails

@@ -9,11 +9,12 @@ import os
 import re
 import struct
 import zlib
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
+from itertools import chain
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, NoReturn
 
 import numpy as np
@@ -30,8 +31,7 @@ if TYPE_CHECKING:
 Numbers = dict[str, NDArray[np.float64]]
 Kind = Literal["csv", "parquet", "xml", "osi", "mcap", "bag"]
 OnRead = Callable[[int], object]  #: called with the number of bytes each time some were read
-#: Place of a row, for a message, and what stands there in a column.
-Find = Callable[[int, "str | None"], tuple[str, str]]
+Find = Callable[[int], tuple[str, Mapping[str, Any]]]  #: place of a row, and what it holds
 
 # Read at once. polars decodes a whole row group for each slice of it: small slices cost time.
 _CSV_BYTES, _PARQUET_ROWS = 1 << 21, 1 << 16
@@ -157,14 +157,6 @@ class Skips:
         count, first = self.kinds.get(kind, (0, self.first[kind]))
         self.kinds[kind] = count + 1, first
 
-    @contextmanager
-    def leaving_out(self, kind: str) -> Iterator[None]:
-        """Leave out what a ValueError is about, which names the place."""
-        try:
-            yield
-        except ValueError as error:
-            self.leave_out(kind, str(error))
-
     def refuse_nothing(self, otherwise: str) -> NoReturn:
         """Raise where no row is left, for what was left out first."""
         raise ValueError(next(iter(self.first.values()), otherwise))
@@ -266,34 +258,30 @@ def mcap_messages(
 ) -> Iterator[tuple[Schema | None, Channel, Message]]:
     """All messages of an MCAP file, whose chunks may have so many bytes; where it ends, they do."""
     with needs("mcap", "mcap", f"{os.fspath(path)}: MCAP"):
-        from mcap.records import Channel, Message, Schema
+        from mcap.exceptions import EndOfFile, RecordLengthLimitExceeded
+        from mcap.records import Channel, Chunk, Message, Schema
+        from mcap.stream_reader import StreamReader, breakup_chunk
+
+    def parts(record: McapRecord) -> Iterable[McapRecord]:
+        if not isinstance(record, Chunk):
+            return [record]
+        return breakup_chunk(_unpacked(record, largest), validate_crc=True)
+
     schemas, channels = dict[int, Schema](), dict[int, Channel]()
-    with readable(path, "MCAP (damaged, cut off, or still being written?)"):
-        for record in _mcap_records(path, largest, skips):
-            if isinstance(record, Schema):
-                schemas[record.id] = record
-            elif isinstance(record, Channel):
-                channels[record.id] = record
-            elif isinstance(record, Message):
-                if (channel := channels.get(record.channel_id)) is None:
-                    raise RefusedError(f"there is no channel {record.channel_id} of a message")
-                yield schemas.get(channel.schema_id), channel, record
-
-
-def _mcap_records(path: str | os.PathLike[str], largest: int, skips: Skips) -> Iterator[McapRecord]:
-    from mcap.exceptions import EndOfFile, RecordLengthLimitExceeded
-    from mcap.records import Chunk
-    from mcap.stream_reader import StreamReader, breakup_chunk
-
-    with open(path, "rb") as file:
+    kind = "MCAP (damaged, cut off, or still being written?)"
+    with readable(path, kind), open(path, "rb") as file:
         size = os.fstat(file.fileno()).st_size
         reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=size)
         try:
-            for record in reader.records:
-                if isinstance(record, Chunk):
-                    yield from breakup_chunk(_unpacked(record, largest), validate_crc=True)
-                else:
-                    yield record
+            for record in chain.from_iterable(map(parts, reader.records)):
+                if isinstance(record, Schema):
+                    schemas[record.id] = record
+                elif isinstance(record, Channel):
+                    channels[record.id] = record
+                elif isinstance(record, Message):
+                    if (channel := channels.get(record.channel_id)) is None:
+                        raise RefusedError(f"there is no channel {record.channel_id} of a message")
+                    yield schemas.get(channel.schema_id), channel, record
         except (EndOfFile, RecordLengthLimitExceeded, struct.error) as error:
             why = f"it ends within a record, or is damaged there: {error}".removesuffix(": ")
             skips.leave_out("cut", f"{os.fspath(path)}, byte {file.tell():,}: {why}")
@@ -341,11 +329,12 @@ class Piece:
 
     def at(self, row: int) -> str:
         """Where a row stands, for a message."""
-        return self.find(row, None)[0]
+        return self.find(row)[0]
 
     def told(self, row: int, name: str, why: str = "", hint: str = "") -> str:
         """Where a row stands, and what is wrong with what it has in a column."""
-        place, text = self.find(row, name)
+        place, fields = self.find(row)
+        text = "" if fields[name] is None else str(fields[name])
         return f"{place}, column {name!r}: {why.format(text[:40]) or explained(text, hint)}"
 
     def leave_out(self, name: str, where: NDArray[np.bool_], why: str = "", hint: str = "") -> None:
@@ -354,19 +343,12 @@ class Piece:
             self.skips.leave_out("field", partial(self.told, row, name, why, hint))
             self.bad[row] = True
 
-    def leave_out_unusable(
-        self,
-        name: str,
-        where: NDArray[np.bool_] | bool = True,
-        hint: str = "",
-        ends: tuple[float, float] = (-LARGEST_OBSERVATION, LARGEST_OBSERVATION),
-        why: str = "",
-    ) -> None:
-        """Leave out rows in which a number is missing, or lies outside of these ends."""
+    def unusable(
+        self, name: str, low: float = -LARGEST_OBSERVATION, high: float = LARGEST_OBSERVATION
+    ) -> NDArray[np.bool_]:
+        """In which rows a number is missing, or lies outside of these ends."""
         numbers = self.numbers[name]
-        unusable = ~((numbers >= ends[0]) & (numbers <= ends[1])) & where
-        if unusable.any():
-            self.leave_out(name, unusable, why, hint)
+        return ~((numbers >= low) & (numbers <= high))
 
     def take(self, rows: NDArray[np.int64]) -> Piece:
         """Some of its rows."""
@@ -375,7 +357,7 @@ class Piece:
             rows=len(rows),
             numbers={name: values[rows] for name, values in self.numbers.items()},
             texts={name: texts.gather(rows) for name, texts in self.texts.items()},
-            find=lambda row, name: self.find(int(rows[row]), name),
+            find=lambda row: self.find(int(rows[row])),
             anew=np.searchsorted(rows, self.anew).tolist(),
             cut=self.cut if rows[-1:].tolist() == [self.rows - 1] else "",
         )
@@ -383,10 +365,12 @@ class Piece:
         return piece
 
 
-def in_row(path: str, columns: Any, before: int, row: int, name: str | None) -> tuple[str, str]:
-    """Where a row stands that is one of some columns, behind so many others; and what it has."""
-    value = None if name is None else columns[name][row]
-    return f"{path}, row {before + row + 1}", "" if value is None else str(value)
+def in_row(
+    path: str, columns: Mapping[str, Any], before: int, row: int
+) -> tuple[str, Mapping[str, Any]]:
+    """Where a row stands that is one of some columns, behind so many others; and what it holds."""
+    place = f"{path}, row {before + row + 1}"
+    return place, {name: column[row] for name, column in columns.items()}
 
 
 class Wanted(NamedTuple):
@@ -683,12 +667,10 @@ class CsvTable(Table):
             )
         return not omissions
 
-    def _find(
-        self, here: Callable[[], _Odd], wanted: Wanted, row: int, name: str | None
-    ) -> tuple[str, str]:
+    def _find(self, here: Callable[[], _Odd], wanted: Wanted, row: int) -> tuple[str, Any]:
         odd = here()
-        text = "" if name is None else odd.rows[row][wanted.all.index(name)]
-        return f"{self.path}, line {odd.lines[row]}", text
+        place = f"{self.path}, line {odd.lines[row]}"
+        return place, dict(zip(wanted.all, odd.rows[row], strict=True))
 
 
 _AS_PARQUET = "Parquet (was a copy or a download interrupted?)"
@@ -736,7 +718,7 @@ class ParquetTable(Table):
             with readable(self.path, _AS_PARQUET):
                 frame = part.slice(first, _PARQUET_ROWS).collect()
             series = {name: frame[name] for name in wanted.all}
-            yield wanted.piece(series, partial(in_row, self.path, frame, first), self.skips)
+            yield wanted.piece(series, partial(in_row, self.path, series, first), self.skips)
             self.skips.on_read(os.path.getsize(self.path) * len(frame) // self._rows)
 
 

@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 
 from evofsm.driving.naming import VARIABLES
 from evofsm.extras import needs
-from evofsm.io.tables import Piece, Skips, Source, Table, Wanted, explained, in_row, mcap_messages
+from evofsm.io import tables
+from evofsm.io.tables import Piece, Skips, Source, Table, Wanted, explained, in_row
 from evofsm.store import LARGEST_OBSERVATION
 
 ACTION = "a_follower"  #: of a pair of vehicles: what the follower did until the next time
@@ -163,7 +164,8 @@ class PairTable(Table):
 
         With it come the gap, bumper to bumper [m], and both speeds [m/s].
         """
-        lane.sort(key=lambda car: (car.along, car.name))
+        if self._lengths:  # by their places along the lane
+            lane.sort(key=lambda car: (car.along, car.name))
         places = np.array([car.place for car in lane])
         for order, car in enumerate(lane):
             for leader, along, distance in _ahead(car, lane, order, places):
@@ -368,7 +370,7 @@ def _by_time(table: Table, wanted: Wanted, prefix: str = "") -> Iterator[Moment]
     now, rows, is_whole = math.nan, list[tuple[Place, Mapping[str, Any]]](), True
     names = [name.removeprefix(prefix) for name in (*wanted.numbers[1:], *wanted.texts)]
     for piece in table.pieces(wanted):
-        piece.leave_out_unusable(wanted.numbers[0])
+        piece.leave_out(wanted.numbers[0], piece.unusable(wanted.numbers[0]))
         columns = [piece.numbers[name].tolist() for name in wanted.numbers]
         columns += [piece.texts[name].to_list() for name in wanted.texts]
         bad = set(np.flatnonzero(piece.bad).tolist())
@@ -447,8 +449,20 @@ _LENGTH = struct.Struct("<I")
 
 
 def objects_of_osi(path: str, skips: Skips) -> Iterator[Moment]:
-    """Read ground truth, or that within sensor views, from a ``.osi`` file, one by one."""
-    osi = _osi(path)
+    """Read ground truth, or that within sensor views, of a ``.osi`` file or the first in MCAP."""
+    with needs("betterosi", "osi", f"{path}: ASAM OSI"):
+        import betterosi as osi
+    is_mcap = tables.file_kind(path) == "mcap"
+    messages = _of_mcap(path, skips) if is_mcap else _of_file(path, osi, skips)
+    for number, (data, is_view) in enumerate(messages, 1):
+        try:
+            yield _moment(osi, f"{path}, message {number}", data, is_view)
+        except ValueError as error:
+            skips.leave_out("message", str(error))
+
+
+def _of_file(path: str, osi: Any, skips: Skips) -> Iterator[tuple[bytes, bool]]:
+    """Messages, and whether they are sensor views, as the first one tells."""
     with Source(path, skips) as source:
         is_view, number = False, 0
         while head := source.read(_LENGTH.size):
@@ -466,36 +480,7 @@ def objects_of_osi(path: str, skips: Skips) -> Iterator[Moment]:
                 return
             if number == 1:
                 is_view = _is_view(osi, data)
-            with skips.leaving_out("message"):
-                yield _moment(osi, f"{path}, message {number}", data, is_view)
-
-
-def objects_of_mcap(path: str, skips: Skips) -> Iterator[Moment]:
-    """Read OSI in MCAP: the first channel of ground truth or of sensor views."""
-    osi = _osi(path)
-    channel_id, number, kinds = None, 0, set[str]()
-    for schema, channel, message in mcap_messages(path, _MOST_BYTES, skips):
-        kind = "" if schema is None else schema.name.rpartition(".")[2]
-        kinds.add(kind)
-        if channel_id is None and kind in ("GroundTruth", "SensorView"):
-            channel_id = channel.id
-        if channel.id == channel_id:
-            number += 1
-            skips.on_read(len(message.data))
-            with skips.leaving_out("message"):
-                yield _moment(osi, f"{path}, message {number}", message.data, kind == "SensorView")
-    if channel_id is None:
-        names = ", ".join(sorted(kinds - {""})) or "none"
-        skips.refuse_nothing(
-            f"{path}: no channel of it holds GroundTruth or SensorView of OSI; its schemas are "
-            f"{names} (of a bag of ROS 2 --topics says what they mean, whatever its header says)"
-        )
-
-
-def _osi(path: str) -> Any:
-    with needs("betterosi", "osi", f"{path}: ASAM OSI"):
-        import betterosi
-    return betterosi
+            yield data, is_view
 
 
 def _is_view(osi: Any, data: bytes) -> bool:
@@ -505,6 +490,25 @@ def _is_view(osi: Any, data: bytes) -> bool:
         return truth is not None and truth.has_field("timestamp")
     except ValueError:
         return False
+
+
+def _of_mcap(path: str, skips: Skips) -> Iterator[tuple[bytes, bool]]:
+    """The same of the first channel of ground truth or of sensor views."""
+    channel_id, kinds = None, set[str]()
+    for schema, channel, message in tables.mcap_messages(path, _MOST_BYTES, skips):
+        kind = "" if schema is None else schema.name.rpartition(".")[2]
+        kinds.add(kind)
+        if channel_id is None and kind in ("GroundTruth", "SensorView"):
+            channel_id = channel.id
+        if channel.id == channel_id:
+            skips.on_read(len(message.data))
+            yield message.data, kind == "SensorView"
+    if channel_id is None:
+        names = ", ".join(sorted(kinds - {""})) or "none"
+        skips.refuse_nothing(
+            f"{path}: no channel of it holds GroundTruth or SensorView of OSI; its schemas are "
+            f"{names} (of a bag of ROS 2 --topics says what they mean, whatever its header says)"
+        )
 
 
 def _moment(osi: Any, place: str, data: bytes, is_view: bool) -> Moment:
