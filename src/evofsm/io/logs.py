@@ -768,6 +768,7 @@ class _Reader:
         self._episode = usual if columns.episode is None else list(columns.episode)
         self._conditions = columns.conditions
         self._failed = self._conditions.get("--failed")
+        self._terms = [term for c in self._conditions.values() for term in c.terms]
         self._before = 0  # rows
         self._first_date = self._last_date = np.nan
         self._hours = 0.0  # that went by unsaid, as summer time ended
@@ -786,8 +787,7 @@ class _Reader:
     def chunks(self) -> Iterator[Chunk]:
         action, clock = self._columns.action, self._clock
         request, factors = self._wanted()
-        terms = [term for condition in self._conditions.values() for term in condition.terms]
-        uses = {*self._observed, *(term.column for term in terms)}  # who compares knows better
+        uses = {*self._observed, *(t.column for t in self._terms)}  # who compares knows better
         last_chunk: Chunk | None = None  # until it is known whether its last row failed
         for piece in filter(attrgetter("rows"), self._table.pieces(request)):
             if action not in uses and (odd := are_stand_ins(piece.numbers[action])).any():
@@ -869,14 +869,10 @@ class _Reader:
     def _wanted(self) -> tuple[Wanted, dict[str, float]]:
         """What is read, and what turns columns into units of the SI, for those that need it."""
         table, columns = self._table, self._columns
-        learnt = [*self._observed, columns.action]
         clock = []
         if self._clock.ticks:  # a date and a time of day may be two columns
             is_one = columns.time in table.columns
             clock = [columns.time] if is_one else columns.time.split(",")
-        terms = [term for condition in self._conditions.values() for term in condition.terms]
-        term_numbers = [term.column for term in terms if term.of_number]
-        term_texts = [term.column for term in terms if not term.of_number]
         categories = [v.name for v in self._variables if isinstance(v, Category)]
         options = {
             **{t.column: option for option, c in self._conditions.items() for t in c.terms},
@@ -901,40 +897,39 @@ class _Reader:
         form = columns.units.get(columns.time, "")
         form = form if "%" in form else ""
         is_dated = clock and (form or tables.is_date(" ".join(map(table.first, clock))))
-        numbers = [*learnt, *term_numbers, *([] if is_dated else clock)]
+        numbers = [*self._observed, columns.action, *(t.column for t in self._terms if t.of_number)]
+        numbers = [*dict.fromkeys([*numbers, *([] if is_dated else clock)])]
+        units = {name: unit for name in numbers if (unit := table.units.get(name))}
+        of_options = {name: unit for name, unit in columns.units.items() if unit != form}
         try:
-            column_units = {name: unit for name in numbers if (unit := table.units.get(name))}
-            units = {name: unit for name, unit in columns.units.items() if unit != form}
-            column_units |= units_of(units, numbers)
-            for name, unit in column_units.items():
-                if unit in tables.UNITS and (unit in tables.TIMES) != (name == columns.time):
-                    raise ValueError(
-                        f"column {name!r} has the unit {unit}; the column of the time needs a unit "
-                        "of time, and no other one may have it (--unit says which it has)"
-                    )
+            units |= units_of(of_options, numbers)
         except ValueError as error:
             raise ValueError(f"{table.path}: {error}") from None
-        self._compare_units(column_units, numbers)
-        self._noted.units |= column_units
-        self._noted.untold += [name for name in numbers if name not in column_units]
-        texts = [*self._episode, *categories, *term_texts]
+        for name in numbers:
+            self._refuse_unit(name, units.get(name, ""))
+        self._noted.units |= units
+        self._noted.untold += [name for name in numbers if name not in units]
+        texts = [*self._episode, *categories, *(t.column for t in self._terms if not t.of_number)]
         request = Wanted(numbers, texts, clock if is_dated else (), form)
-        factors = {n: tables.UNITS[u] for n, u in column_units.items() if u in tables.UNITS}
-        return request, factors
+        return request, {n: tables.UNITS[u] for n, u in units.items() if u in tables.UNITS}
 
-    def _compare_units(self, units: Mapping[str, str], numbers: Sequence[str]) -> None:
-        """Raise where a column has a unit that is not that of the files before, as both tell."""
-        for name in {*numbers} & {*self._noted.units, *self._noted.untold}:
-            pair = now, before = units.get(name, ""), self._noted.units.get(name, "")
-            factor = tables.UNITS.get(now or before, 1.0)
-            bases = {tables.SI.get(unit, unit) for unit in pair}
-            if len(bases) > 1 and (all(pair) or factor != 1.0):
-                remedy = f"--unit {quote(f'{name}={now or before}')} says one for all"
+    def _refuse_unit(self, name: str, unit: str) -> None:
+        """Raise where it is none of the column, or not that of the files before, as both tell."""
+        fault, notes = "", self._noted
+        if unit in tables.UNITS and (unit in tables.TIMES) != (name == self._columns.time):
+            fault = f"the unit {unit}; the column of the time needs a unit of time, and no other "
+            fault += "one may have it (--unit says which it has)"
+        elif name in notes.units or name in notes.untold:
+            before = notes.units.get(name, "")
+            factor = tables.UNITS.get(unit or before, 1.0)
+            is_other = tables.SI.get(unit, unit) != tables.SI.get(before, before)
+            if is_other and ((unit and before) or factor != 1.0):
+                remedy = f"--unit {quote(f'{name}={unit or before}')} says one for all"
                 remedy = remedy if factor != 1.0 else "learn them apart"
-                raise ValueError(
-                    f"{self._table.path}: column {name!r} has {now or 'no unit'}, and "
-                    f"{before or 'no unit'} in the files before; {remedy}"
-                )
+                before = before or "no unit"
+                fault = f"{unit or 'no unit'}, and {before} in the files before; {remedy}"
+        if fault:
+            raise ValueError(f"{self._table.path}: column {name!r} has {fault}")
 
     def _times(self, piece: Piece, *, is_date: bool) -> Floats:
         if not self._clock.ticks:

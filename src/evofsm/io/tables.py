@@ -387,14 +387,14 @@ class Wanted(NamedTuple):
         return list(dict.fromkeys([*self.numbers, *self.texts, *self.dates]))
 
     def piece(
-        self, found: Mapping[str, polars.Series], find: Find, skips: Skips, anew: Sequence[int] = ()
+        self, frame: polars.DataFrame, find: Find, skips: Skips, anew: Sequence[int] = ()
     ) -> Piece:
         """The columns of some rows as what is wanted of them; numbers may be given as texts."""
         import polars
 
-        piece = Piece(len(found[self.all[0]]), {}, find, skips, anew=anew)
-        for name in dict.fromkeys(self.numbers):
-            values = found[name]
+        piece = Piece(len(frame), {}, find, skips, anew=anew)
+        for name in self.numbers:
+            values = frame[name]
             if values.dtype == polars.String:
                 fields = values.str.strip_chars()
                 values = fields.cast(polars.Float64, strict=False)
@@ -403,12 +403,12 @@ class Wanted(NamedTuple):
                     piece.leave_out(name, wrong.to_numpy())
             piece.numbers[name] = values.cast(polars.Float64).to_numpy()
         for name in self.texts:
-            texts = found[name].cast(polars.String)
+            texts = frame[name].cast(polars.String)
             piece.texts[name] = texts.fill_null("") if texts.null_count() else texts
         if self.dates:
-            dates = found[self.dates[0]]
+            dates = frame[self.dates[0]]
             for name in self.dates[1:]:  # the time of day, behind the date
-                dates = dates.cast(polars.String) + " " + found[name].cast(polars.String)
+                dates = dates.cast(polars.String) + " " + frame[name].cast(polars.String)
             numbers = _microseconds(piece, self.dates[0], dates, self.form)
             piece.numbers[",".join(self.dates)] = numbers
         return piece
@@ -439,8 +439,7 @@ class _Odd(NamedTuple):
     """What Python's own reader makes of some lines."""
 
     columns: Sequence[str]  #: of the next lines
-    lines: list[int]  #: of the rows
-    rows: list[list[str]]  #: what is wanted of them
+    rows: list[tuple[int, list[str]]]  #: lines, and what is wanted of them
     anew: list[int]  #: rows before which something was left out, or the columns are named again
     left_out: list[tuple[int, str]]  #: lines that are no rows, and why; of a comment nothing
 
@@ -541,6 +540,7 @@ class CsvTable(Table):
     def pieces(self, wanted: Wanted) -> Iterator[Piece]:
         """Read columns, in the order of rows."""
         import polars
+        from polars import selectors
 
         if twice := [name for name in wanted.all if self.columns.count(name) > 1]:
             fault = f"two columns are called {twice[0]!r}"
@@ -549,29 +549,24 @@ class CsvTable(Table):
         with Source(self.path, self.skips) as source:
             for block, lines_before in self._blocks(source):
                 here = partial(self._odd, block, lines_before, columns, wanted)
-                series, anew = self._plain(block, columns, wanted), [0] if behind else []
+                frame, anew = self._plain(block, columns, wanted), [0] if behind else []
                 is_cut = source.is_cut
-                if series is None:
+                if frame is None:
                     odd = here()
                     columns, anew = odd.columns, anew + odd.anew
-                    is_cut &= odd.lines[-1:] == [lines_before + block.count(b"\n")]
+                    is_cut &= lines_before + block.count(b"\n") in [n for n, _ in odd.rows[-1:]]
                     for line, why in odd.left_out:
                         place = f"{self.path}, line {line}: {why or 'a comment'}"
                         self.skips.leave_out("row" if why else "comment", place, bool(why))
-                    fields = zip(*odd.rows, strict=True) if odd.rows else [()] * len(wanted.all)
-                    series = {
-                        name: polars.Series(name, texts, polars.String)
-                        for name, texts in zip(wanted.all, fields, strict=True)
-                    }
+                    schema = dict.fromkeys(wanted.all, polars.String)
+                    fields = [fields for _, fields in odd.rows]
+                    frame = polars.DataFrame(fields, schema, orient="row")
                 if self._dialect.has_commas:
-                    for name in wanted.numbers:
-                        if series[name].dtype == polars.String:
-                            series[name] = series[name].str.replace(",", ".", literal=True)
-                n_rows = len(series[wanted.all[0]])
-                behind = n_rows in anew
-                if n_rows or anew:
-                    find = partial(self._find, here, wanted)
-                    piece = wanted.piece(series, find, self.skips, anew)
+                    texts = selectors.by_name(wanted.numbers) & selectors.string()
+                    frame = frame.with_columns(texts.str.replace(",", ".", literal=True))
+                behind = len(frame) in anew
+                if len(frame) or anew:
+                    piece = wanted.piece(frame, partial(self._find, here, wanted), self.skips, anew)
                     piece.cut = columns[-1] if is_cut else ""
                     yield piece
 
@@ -590,44 +585,36 @@ class CsvTable(Table):
 
     def _plain(
         self, block: bytes, columns: Sequence[str], wanted: Wanted
-    ) -> dict[str, polars.Series] | None:
+    ) -> polars.DataFrame | None:
         """The columns, numbers as such where all are; None where anything is odd."""
         import polars
 
         if b'"' in block and 2 * len(self._quoted.findall(block)) != _count(block, b'"'):
             return None
-        places = {name: columns.index(name) for name in wanted.all}
         # As polars calls columns, for there may be two of one name.
+        names = {f"column_{columns.index(name) + 1}": name for name in wanted.all}
         kinds: dict[str, Any] = {f"column_{k + 1}": polars.String for k in range(len(columns))}
-        numbers = {f"column_{places[name] + 1}": polars.Float64 for name in wanted.numbers}
+        numbers = {place: polars.Float64 for place, name in names.items() if name in wanted.numbers}
         separator, has_commas = self._dialect.separator, self._dialect.has_commas
         dialect: Any = {"separator": separator, "decimal_comma": has_commas}
         for schema in (kinds | numbers, kinds):
             try:
-                frame = polars.read_csv(
-                    block,
-                    columns=[f"column_{place + 1}" for place in places.values()],
-                    schema=schema,
-                    **dialect,
-                    **_PLAIN,
-                )
+                frame = polars.read_csv(block, columns=[*names], schema=schema, **dialect, **_PLAIN)
             except (polars.exceptions.PolarsError, polars.exceptions.PanicException):
                 return None
             if _count(block, separator.encode()) != len(frame) * (len(columns) - 1):
                 return None
-            if not any(frame[name].null_count() for name in numbers):
+            if not any(frame[place].null_count() for place in numbers):
                 break
-        series = {name: frame[f"column_{place + 1}"] for name, place in places.items()}
-        texts = (series[name] for name in wanted.numbers if series[name].dtype == polars.String)
-        names_anew = any(text.str.strip_chars().is_in(wanted.all).any() for text in texts)
-        return None if names_anew else series
+        frame = frame.rename(names)
+        texts = frame.select(wanted.numbers).select(polars.col(polars.String).str.strip_chars())
+        return None if any(text.is_in(wanted.all).any() for text in texts) else frame
 
     def _odd(self, block: bytes, reached: int, columns: Sequence[str], wanted: Wanted) -> _Odd:
         """The rows of some lines; those of another length are none."""
         text = io.StringIO(block.decode(), newline="")
         reader = csv.reader(text, delimiter=self._dialect.separator, strict=True)
-        lines, rows, anew = list[int](), list[list[str]](), list[int]()
-        left_out = list[tuple[int, str]]()
+        rows, anew, left_out = list[tuple[int, list[str]]](), list[int](), list[tuple[int, str]]()
         places = [columns.index(name) for name in wanted.all]
         may_name = any(name.encode() in block for name in wanted.all)
         last_line = 0
@@ -638,22 +625,21 @@ class CsvTable(Table):
                     if may_name and self._named_anew(fields, wanted, line):
                         columns = _names(fields)
                         places = [columns.index(name) for name in wanted.all]
-                        anew.append(len(lines))
+                        anew.append(len(rows))
                     elif len(fields) == len(columns):
-                        lines.append(line)
-                        rows.append([fields[place] for place in places])
+                        rows.append((line, [fields[place] for place in places]))
                     elif _COMMENT.match(fields[0]):
                         left_out.append((line, ""))
                     else:
-                        anew.append(len(lines))
+                        anew.append(len(rows))
                         left_out.append((line, self._dialect.miscounted(len(fields), len(columns))))
                     last_line = reader.line_num
-                return _Odd(columns, lines, rows, anew, left_out)
+                return _Odd(columns, rows, anew, left_out)
             except csv.Error as error:
                 line, why = reached + reader.line_num, f"{error} (an unclosed quote?)"
                 if reader.line_num > last_line + 1:
                     raise ValueError(f"{self.path}, line {line}: {why}") from error
-                anew.append(len(lines))
+                anew.append(len(rows))
                 left_out.append((line, why))
                 last_line = reader.line_num
 
@@ -668,9 +654,8 @@ class CsvTable(Table):
         return not omissions
 
     def _find(self, here: Callable[[], _Odd], wanted: Wanted, row: int) -> tuple[str, Any]:
-        odd = here()
-        place = f"{self.path}, line {odd.lines[row]}"
-        return place, dict(zip(wanted.all, odd.rows[row], strict=True))
+        line, fields = here().rows[row]
+        return f"{self.path}, line {line}", dict(zip(wanted.all, fields, strict=True))
 
 
 _AS_PARQUET = "Parquet (was a copy or a download interrupted?)"
@@ -717,8 +702,8 @@ class ParquetTable(Table):
         for first in range(0, self._rows, _PARQUET_ROWS):
             with readable(self.path, _AS_PARQUET):
                 frame = part.slice(first, _PARQUET_ROWS).collect()
-            series = {name: frame[name] for name in wanted.all}
-            yield wanted.piece(series, partial(in_row, self.path, series, first), self.skips)
+            find = partial(in_row, self.path, frame.to_dict(), first)
+            yield wanted.piece(frame, find, self.skips)
             self.skips.on_read(os.path.getsize(self.path) * len(frame) // self._rows)
 
 
