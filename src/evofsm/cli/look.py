@@ -108,14 +108,13 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     ends = [np.append(np.flatnonzero(np.diff(segments)), -1)]
     ends += [places[rows] for *_, rows in rare[:1]]
     last = np.concatenate(ends)  # of an episode, or a failure's first
-    columns = {
-        name: _range(name, z[order], (runs | (name == still))[order], last)
-        for name, z in values.items()
-    }
-    for name in (name for name in values if tables.UNITS.get(units[name], 1.0) != 1.0):
-        columns[name] += f" {tables.SI[units[name]]}, from {units[name]}"
-    for name in (name for name in values if len(stand_ins[name])):
-        columns[name] += f"; {', '.join(f'{x:g}' for x in stand_ins[name])} for none"
+    columns = dict[str, str]()
+    for name, z in values.items():
+        columns[name] = _range(name, z[order], (runs | (name == still))[order], last)
+        if tables.UNITS.get(units[name], 1.0) != 1.0:
+            columns[name] += f" {tables.SI[units[name]]}, from {units[name]}"
+        if len(stand_ins[name]):
+            columns[name] += f"; {', '.join(f'{x:g}' for x in stand_ins[name])} for none"
     columns |= {name: _told(frame[name]) for name in texts}
     facts = [*columns.items()][:_COLUMNS_SHOWN]
     if more := len(columns) - len(facts):

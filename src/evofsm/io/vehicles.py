@@ -70,20 +70,17 @@ Moment = tuple[float, Place, list[tuple[Place, Mapping[str, Any]]]]
 _Pair = tuple[str, str, str]  #: lane, follower and leader
 
 
+@dataclass
 class PairTable(Table):
     """The pairs of a file, as a table with a row for each pair and time; episodes end to end."""
 
+    path: str
+    moments: Iterable[Moment]
+    skips: Skips
+    lengths: VehicleLengths | None = None  #: of FCD
+
     columns = COLUMNS
     derives = True
-
-    def __init__(
-        self,
-        path: str,
-        moments: Iterable[Moment],
-        skips: Skips,
-        lengths: VehicleLengths | None = None,  # of FCD
-    ) -> None:
-        self.path, self.skips, self._moments, self._lengths = path, skips, moments, lengths
 
     def pieces(self, wanted: Wanted) -> Iterator[Piece]:
         """All columns, whichever are wanted."""
@@ -106,9 +103,9 @@ class PairTable(Table):
     def _episodes(self) -> Iterator[tuple[_Pair, array[float] | None]]:
         """Rows of a pair for as long as it stays one, or until too many wait."""
         open_pairs: dict[_Pair, array[float]] = {}
-        vehicle_of = _object if self._lengths is None else partial(_car, self._lengths)
+        vehicle_of = _object if self.lengths is None else partial(_car, self.lengths)
         before, headings, has_lanes = -math.inf, dict[str, complex](), False
-        for time, where, entries in self._moments:
+        for time, where, entries in self.moments:
             try:  # persons, and vehicles off the road, have no lane
                 cars = [vehicle_of(*entry) for entry in entries if entry[1].get("lane")]
             except ValueError as error:  # without one of them, others would be taken for pairs
@@ -136,9 +133,7 @@ class PairTable(Table):
                 open_pairs = {}
         yield from open_pairs.items()
         if not has_lanes:
-            self.skips.refuse_nothing(
-                self.path + (_NO_OBJECT if self._lengths is None else _NO_CAR)
-            )
+            self.skips.refuse_nothing(self.path + (_NO_OBJECT if self.lengths is None else _NO_CAR))
 
     def _lanes(
         self, time: float, cars: Iterable[Vehicle], headings: dict[str, complex]
@@ -157,14 +152,14 @@ class PairTable(Table):
                 car = car._replace(heading=headings.get(car.name, car.heading))
             headings[car.name] = car.heading
             lanes[car.lane].append(car)
-        return [lanes[name] for name in (sorted(lanes) if self._lengths else lanes)]
+        return [lanes[name] for name in (sorted(lanes) if self.lengths else lanes)]
 
     def _pairs(self, lane: list[Vehicle]) -> Iterator[tuple[_Pair, tuple[float, float, float]]]:
         """Each vehicle of a lane and the nearest one ahead, not beside its way nor towards it.
 
         With it come the gap, bumper to bumper [m], and both speeds [m/s].
         """
-        if self._lengths:  # by their places along the lane
+        if self.lengths:  # by their places along the lane
             lane.sort(key=lambda car: (car.along, car.name))
         places = np.array([car.place for car in lane])
         for order, car in enumerate(lane):
@@ -178,8 +173,8 @@ class PairTable(Table):
                 is_oncoming = abs(headings) < 1.0
                 if not (is_oncoming or aside >= 0.5 * (car.width + leader.width)):
                     gap = distance - (car.front + leader.rear)
-                    if self._lengths and gap <= 0.0 and aside > _IN_LINE:
-                        self._lengths.overlaps[leader.kind] += 1
+                    if self.lengths and gap <= 0.0 and aside > _IN_LINE:
+                        self.lengths.overlaps[leader.kind] += 1
                     yield (car.lane, car.name, leader.name), (gap, car.speed, leader.speed)
                     break
 
