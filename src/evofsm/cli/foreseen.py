@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import RenderableType
 
-from evofsm.cli.options import picture
+from evofsm.cli.options import Alarms, picture
 from evofsm.cli.show import facts, print_json, show, table
 from evofsm.fsm import EvolvingFSM, Labels
 from evofsm.fsm.proportions import poisson_bounds
@@ -31,26 +31,21 @@ _HEADER = ("stated", "foreseen", *_CAME, "thresholds", *_CAME)
 
 
 def guard_where_nobody_acts(
-    episodes: Sequence[Chunk],
-    labels: Labels,
-    horizon: float | None,
-    hold: float,
-    false_a_day: float | None,
-    machine: EvolvingFSM | None = None,
+    episodes: Sequence[Chunk], labels: Labels, alarms: Alarms, machine: EvolvingFSM | None = None
 ) -> Guard:
     """A guard that alarms before failures, as it was learnt from the episodes of a log."""
     rows, failed = [e.observations for e in episodes], [e.failed for e in episodes]
-    settings: dict[str, Any] = {"dt": float(episodes[0].dt), "horizon": horizon, "hold": hold}
-    settings |= {"names": labels.names, "units": labels.units}
+    settings: dict[str, Any] = {"dt": float(episodes[0].dt), "horizon": alarms[0]}
+    settings |= {"hold": alarms[1], "names": labels.names, "units": labels.units}
     judge = Foresight.learn_log(rows, failed, **settings)
-    return guard_of_alarms(judge, false_a_day, machine, learn=False)
+    return guard_of_alarms(judge, alarms, machine, learn=False)
 
 
 def guard_of_alarms(
-    judge: Foresight, false_a_day: float | None, machine: EvolvingFSM | None, *, learn: bool
+    judge: Foresight, alarms: Alarms, machine: EvolvingFSM | None, *, learn: bool
 ) -> Guard:
     """A guard where nobody acts, with so many false alarms a day that are stated."""
-    judge.stated = RATE if false_a_day is None else false_a_day
+    judge.stated = RATE if alarms[-1] is None else alarms[-1]
     reviser = ActionReviser(judge, Choices(1), tolerance=_ANY_ALARM, mode=Mode.SHADOW)
     return Guard.of(reviser, interval=judge.dt, machine=machine, learn=learn)
 
@@ -59,35 +54,29 @@ def show_foreseen(
     file: Path,
     episodes: Sequence[Chunk],
     guard: Guard | None,
-    names: Sequence[str],
-    units: Sequence[str],
-    asked: tuple[float | None, float, float | None],
+    labels: Labels,
+    asked: Alarms,
     split: float,
     plot: Path | None,
     *,
     as_json: bool,
 ) -> None:
-    """Say what came of the alarms of a guard, or of one that learns from the log's first part.
-
-    What is asked for are the horizon, the hold time and false alarms a day.
-    """
+    """Say what came of the alarms of a guard, or of one that learns from the log's first part."""
     title, held_out = str(file), "; not held out, if this guard learnt from them"
     if guard is None:
         rows = np.cumsum([len(e.times) for e in episodes])
         first = int((rows <= split * rows[-1]).sum())
         first_part, episodes = _of_two_rows(episodes[:first]), episodes[first:]
-        fault = ""
-        if not any(e.failed for e in (*first_part, *episodes)):
-            fault = "no episode failed, so there is nothing to foresee (--failed says what did)"
-        elif not (first_part and _of_two_rows(episodes)):
+        failures, later = (sum(e.failed for e in part) for part in (first_part, episodes))
+        fault = f"none failed in the first {split:.0%} of the rows, which it learns from, but "
+        fault += f"{later:,} later did (--split)"
+        if not (first_part and _of_two_rows(episodes)):
             fault = "it takes two episodes at least, to learn and to judge"
-        elif not any(e.failed for e in first_part):
-            fault = f"none failed in the first {split:.0%} of the rows, which it learns from, but "
-            fault += f"{sum(e.failed for e in episodes):,} later did (--split)"
-        if fault:
+        if not failures + later:
+            fault = "no episode failed, so there is nothing to foresee (--failed says what did)"
+        if not (failures and _of_two_rows(episodes)):
             raise ValueError(f"{file}: {fault}")
-        labels = Labels(names=tuple(names), units=tuple(units))
-        guard = guard_where_nobody_acts(first_part, labels, *asked)
+        guard = guard_where_nobody_acts(first_part, labels, asked)
         learnt_from = "episode" if first == 1 else f"{len(first_part):,} episodes"
         title += f": learnt from its first {learnt_from}, judged by the rest"
         held_out = f", held out (the last {1.0 - rows[first - 1] / rows[-1]:.0%} of the rows)"

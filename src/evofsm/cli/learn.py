@@ -93,13 +93,10 @@ def learn(
     if kind == "learnt" and columns.acts and len(lesson.levels) < 2:
         fault = "is always the same, so that nothing tells what others would do (--action '')"
         raise ValueError(f"--guard: {columns.action} {fault}")
-    model = lesson.model
+    model, counts = lesson.model, lesson.counts
     provenance = {
         "files": [{"name": n, "bytes": size} for n, size in zip(files, sizes, strict=True)],
-        "rows": lesson.rows,
-        "episodes": lesson.episodes,
-        "transitions": lesson.transitions,
-        "failures": lesson.failures,
+        **{name: counts[name] for name in ("rows", "episodes", "transitions", "failures")},
         "read with": {k: v for k, v in reading.items() if k != "topics"},
     }
     warnings = learning.warnings_of(notes, columns)
@@ -111,7 +108,7 @@ def learn(
     if guard is not None and kind is not None:
         if columns.acts:
             new_guard = learning.guard_of_log(kind, model, machine, brakes, tolerance)
-            with progress("Teaching the guard", lesson.rows) as move:
+            with progress("Teaching the guard", counts["rows"]) as move:
                 share = learning.teach(new_guard, read_traces(files, columns), move)
             if new_guard.machine is not None:
                 new_guard.machine.tell_of_failures(told=model.failures_told)
@@ -120,7 +117,7 @@ def learn(
         else:
             episodes = [chunk for chunk in episodes_of(chunks) if len(chunk.times) > 1]
             new_guard = foreseen.guard_where_nobody_acts(
-                episodes, model.labels, *alarms, lesson.machine
+                episodes, model.labels, alarms, lesson.machine
             )
         new_guard.save(guard, provenance)
     if as_json:
@@ -129,7 +126,7 @@ def learn(
         print_json({**document, "noted": notes, "warnings": warnings})
         return
     pairs = [*learning.read_of(lesson, columns.action * columns.acts)]
-    pairs += learning.read_otherwise(notes, columns, lesson)
+    pairs += learning.read_otherwise(notes, columns, counts)
     if columns.lengths.seen:
         pairs.append(("vehicle lengths", f"assumed, for FCD has none: {columns.lengths}"))
     learner = new_guard and new_guard.judge
@@ -141,7 +138,7 @@ def learn(
     elif out is not None:
         say(f"Saved to {out}. Look at it again: evofsm inspect {out}")
     if new_guard is not None:
-        beyond = (lesson.clipped_below + lesson.clipped_above) / lesson.rows
+        beyond = (counts["clipped_below"] + counts["clipped_above"]) / counts["rows"]
         for line in learning.told_of_guard(new_guard, guard, brakes, beyond):
             say(line)
 

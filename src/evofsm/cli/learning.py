@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import os
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from shlex import quote
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -51,45 +51,17 @@ _MOST_ACTIONS = 1000
 _NOBODY = (0.0, -1.0, 255.0, 999.0, 9999.0, 65535.0)  # stand for that in many recordings
 
 
-@dataclass
-class Learning:
+class Learning(NamedTuple):
     """What was learnt, and from what."""
 
+    model: FSMModel
     machine: EvolvingFSM  #: can go on learning
     actions: IntervalActions
-    rows: int = 0  #: observations
-    episodes: int = 0
-    seconds: float = 0.0  #: time between the first and the last row of the episodes, together [s]
-    clipped_below: int = 0  #: actions below the range, put into its first interval
-    clipped_above: int = 0  #: actions above the range, put into its last interval
-    jumps: int = 0  #: episodes that began because of a hole in time
-    failures: int = 0  #: episodes that ended in failure
-    dt: float = np.nan  #: usual time between two rows [s]
-    last_time: float = np.nan  #: of the latest row [s]
-    levels: set[float] = field(default_factory=set)  #: numbers of the action, while they are few
-    model: FSMModel = field(init=False)  #: once all is learnt
-
-    @property
-    def transitions(self) -> int:
-        """How many were learnt."""
-        return int(self.model.uses.sum())
-
-    def take(self, chunk: Chunk) -> None:
-        """Learn a chunk, and count what is in it."""
-        learn_chunk(self.machine, chunk, self.actions)
-        self.dt = chunk.dt
-        steps = np.diff(chunk.times, prepend=self.last_time)
-        steps[chunk.begins] = 0.0
-        self.last_time = float(chunk.times[-1])
-        self.seconds += float(steps.sum())
-        self.rows += len(steps)
-        self.episodes += int(chunk.begins.sum())
-        self.jumps += chunk.jumps
-        self.failures += int(chunk.fails.sum())
-        self.clipped_below += int((chunk.actions < self.actions.low).sum())
-        self.clipped_above += int((chunk.actions > self.actions.high).sum())
-        if len(self.levels) <= MOST_LEVELS:
-            self.levels.update(np.unique(chunk.actions[~np.isnan(chunk.actions)]).tolist())
+    #: Rows, episodes, transitions, episodes that began because of a hole in time (jumps) or ended
+    #: in failure (failures), actions put into the first and last interval (clipped_below, _above).
+    counts: Counter[str]
+    seconds: float  #: between the first and the last rows of the episodes, together
+    levels: set[float]  #: numbers of the action, while they are few
 
 
 def learn_traces(
@@ -100,18 +72,32 @@ def learn_traces(
     units: Callable[[], Sequence[str]] = tuple,
 ) -> Learning:
     """Learn all chunks in their order, each row once; units are known once they are read."""
-    lesson = Learning(machine.copy(), actions)
+    machine, counts, levels = machine.copy(), Counter[str](), set[float]()
+    dt, last_time, seconds = math.nan, math.nan, 0.0
     for chunk in chunks:
-        lesson.take(chunk)
-    lesson.machine.start_episode()  # so that the last one counts, too
-    dt = None if np.isnan(lesson.dt) else lesson.dt
-    lesson.model = lesson.machine.model(actions=actions, names=names, units=units(), dt=dt)
-    if lesson.transitions == 0:
+        learn_chunk(machine, chunk, actions)
+        dt, steps = chunk.dt, np.diff(chunk.times, prepend=last_time)
+        last_time, seconds = float(chunk.times[-1]), seconds + float(steps[~chunk.begins].sum())
+        counts.update(
+            rows=len(steps),
+            episodes=int(chunk.begins.sum()),
+            clipped_below=int((chunk.actions < actions.low).sum()),
+            clipped_above=int((chunk.actions > actions.high).sum()),
+            jumps=chunk.jumps,
+            failures=int(chunk.fails.sum()),
+        )
+        if len(levels) <= MOST_LEVELS:
+            levels.update(np.unique(chunk.actions[~np.isnan(chunk.actions)]).tolist())
+    machine.start_episode()  # so that the last one counts, too
+    step = None if math.isnan(dt) else dt
+    model = machine.model(actions=actions, names=names, units=units(), dt=step)
+    counts["transitions"] = int(model.uses.sum())
+    if not counts["transitions"]:
         raise ValueError(
             "no transition could be learnt: no row with an action is followed by another row of "
             "its episode (is every row an episode? are the rows sorted by episode and time?)"
         )
-    return lesson
+    return Learning(model, machine, actions, counts, seconds, levels)
 
 
 # -- What was noticed in reading ------------------------------------------------------------------
@@ -417,25 +403,22 @@ def told_of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float)
 
 def document_of(learning: Learning, provenance: Mapping[str, Any]) -> dict[str, Any]:
     """All that is printed, for JSON; states and actions from 0."""
-    names = ("rows", "episodes", "seconds", "clipped_below", "clipped_above", "jumps", "failures")
-    totals = {name: getattr(learning, name) for name in names}
-    if not learning.model.failures_told:
-        totals["failures"] = None
-    model = {**model_document(learning.model), "provenance": provenance}
-    return {**totals, "transitions": learning.transitions, "model": model}
+    model, totals = learning.model, {**learning.counts, "seconds": learning.seconds}
+    untold = {} if model.failures_told else {"failures": None}
+    return {**totals, **untold, "model": {**model_document(model), "provenance": provenance}}
 
 
 def read_of(learning: Learning, action: str) -> Iterator[tuple[str, str]]:
     """What was read, and the actions and the rule that it was learnt with."""
-    actions = learning.actions
-    yield "rows", f"{learning.rows:,}, one every {learning.model.dt:g} s"
-    yield "episodes", f"{learning.episodes:,}, together {span(learning.seconds)}"
-    yield "transitions", f"{learning.transitions:,}"
+    actions, counts = learning.actions, learning.counts
+    yield "rows", f"{counts['rows']:,}, one every {learning.model.dt:g} s"
+    yield "episodes", f"{counts['episodes']:,}, together {span(learning.seconds)}"
+    yield "transitions", f"{counts['transitions']:,}"
     text = f"{actions.n_actions} intervals of {action} from {actions.low:g} to {actions.high:g}"
-    if n_beyond := learning.clipped_below + learning.clipped_above:
-        text += f"; {learning.clipped_below:,} below and {learning.clipped_above:,} above "
-        text += f"({n_beyond / learning.rows:.1%} of rows) were put into the end intervals"
-    text = text if n_beyond else f"{text}; none was beyond"
+    below, above = counts["clipped_below"], counts["clipped_above"]
+    share = f"{(below + above) / counts['rows']:.1%} of rows"
+    beyond = f"{below:,} below and {above:,} above ({share}) were put into the end intervals"
+    text += f"; {beyond if below + above else 'none was beyond'}"
     if 0 < len(indices := np.flatnonzero(learning.model.uses)) < actions.n_actions:
         low, high = actions.edges[[indices[0], indices[-1] + 1]].tolist()
         text += f"; it was in {len(indices)}, {low:g} to {high:g}: what others do is extrapolated"
@@ -457,13 +440,13 @@ def read_of(learning: Learning, action: str) -> Iterator[tuple[str, str]]:
 
 
 def read_otherwise(
-    noted: Noted, columns: LogColumns, learning: Learning
+    noted: Noted, columns: LogColumns, counts: Counter[str]
 ) -> Iterator[tuple[str, str]]:
     """What was not learnt as it stands in the files."""
     if columns.failed is None:
         yield "failures", "not known; --failed COLUMN or --failed 'gap<=0' says them"
     else:
-        text = f"{counted(learning.failures, 'episode')} ended with {columns.failed}"
+        text = f"{counted(counts['failures'], 'episode')} ended with {columns.failed}"
         left_out = f"; {noted.after_failure:,} rows after them, still so, were left out"
         yield "failures", text + (left_out if noted.after_failure else "")
     hole = columns.longest_hole
@@ -474,7 +457,7 @@ def read_otherwise(
         yield "resampled", f"{means} (--resample {step:g}s,NAME=max: others are min, last)"
     if noted.crossed:
         yield "holes", f"{noted.crossed:,} of at most {hole:g} s (--hole) cost a transition each"
-    if jumps := learning.jumps:
+    if jumps := counts["jumps"]:
         yield "time jumps", f"{jumps:,}; each begins an episode (a longer --hole bridges them)"
     if noted.leaderless:
         nobody = columns.no_leader not in (None, "end")

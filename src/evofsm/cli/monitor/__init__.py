@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack, nullcontext
+from functools import partial
 from hashlib import sha256
 from itertools import chain
 from pathlib import Path
@@ -94,7 +95,7 @@ def monitor(
                 raise ValueError(f"one FILE is read; cat joins several, names and all: {path}")
             else:
                 file = path
-    if sum(source is not None for source in (file, socket, zenoh)) > 1:
+    if [file, socket, zenoh].count(None) < 2:
         raise ValueError("give one of FILE, --socket and --zenoh")
     if plot is not None and not summary:
         raise ValueError("--plot draws what --summary says, where nobody acts")
@@ -113,7 +114,8 @@ def monitor(
     from evofsm.cli.show import show, warn
     from evofsm.driving.cars import assumptions, guard_of_monitor
     from evofsm.driving.naming import VARIABLES
-    from evofsm.guard import Foresight, Guard
+    from evofsm.fsm import Labels
+    from evofsm.guard import AuditLog, Foresight, Guard
     from evofsm.io.tables import is_number
 
     acts = {"low": low, "high": high, "n_actions": n_actions}
@@ -122,26 +124,22 @@ def monitor(
     if guard is not None and (idle := [name for name, part in choices.items() if part is not None]):
         name = idle[0].replace("_", "-")
         raise ValueError(f"--{name} is for a guard that is made here; {guard} has learnt its own")
-    accepted_risk = options.TOLERANCE if tolerance is None else tolerance
-    alarms = horizon, persist, false_a_day
-
-    def fresh() -> Guard:
-        if guard is not None:
-            return Guard.load(guard)
-        if new_guard is not None:
-            return new_guard
-        return guard_of_monitor(interval or _INTERVAL, brakes, accepted_risk, traffic=traffic)
-
-    parts = {**acts, "observe": observe}
-    system, new_guard = {name: part for name, part in parts.items() if part is not None}, None
-    if guard is None and not is_log and (system or "action" in reading):
+    parts, alarms = {**acts, "observe": observe}, (horizon, persist, false_a_day)
+    system = {name: part for name, part in parts.items() if part is not None}
+    how: Any = brakes, options.TOLERANCE if tolerance is None else tolerance
+    make: Any = partial(guard_of_monitor, interval or _INTERVAL, *how, traffic=traffic)
+    notice, failed = assumptions(*how), None
+    if guard is not None:
+        make, notice = partial(Guard.load, guard), f"assumed: what {guard} was given and has learnt"
+    elif not is_log and (system or "action" in reading):
         if traffic:
             raise ValueError("--traffic is of cars, and goes with no --observe or --action")
-        new_guard, learn = begun({**system}, reading, interval, tolerance, alarms), True
-    defaults = options.read_with(guard or state)
-    learnt_of = defaults.pop("observe", None)
+        make, learn = partial(begun, system, reading, interval, tolerance, alarms), True
+        failed = (new_guard := make()).failed
+        notice = f"a guard of {', '.join(new_guard.variables)} learns from what comes"
+    reader, rows = {**options.read_with(guard or state), **reading}, EPISODE
+    learnt_of = reader.pop("observe", None)
     observe = observe or learnt_of
-    reader, rows = {**defaults, **reading}, EPISODE
     if episode is not None and is_number(episode) and not is_log:
         if not (episode.isdecimal() and int(episode)):
             raise ValueError(f"--episode is {episode!r}; it is a number of rows, or columns")
@@ -155,7 +153,7 @@ def monitor(
             from evofsm.cli.learning import episodes_read
             from evofsm.io.logs import Noted
 
-            sentry = fresh() if guard else None
+            sentry = make() if guard else None
             alone = reader.get("action") == "" or isinstance(sentry and sentry.judge, Foresight)
             names = sentry.variables if sentry else VARIABLES
             if observe is None or {*options.split_names(observe)} == {*names}:  # in its own order
@@ -175,7 +173,8 @@ def monitor(
             if alone:
                 options.refuse_other_limit(False, alarms, tolerance)
                 every, names = list(chunks), log_format.observe.names
-                about = names, notes.si_units(names), alarms, split, plot
+                labels = Labels(names=names, units=tuple(notes.si_units(names)))
+                about = labels, alarms, split, plot
                 show_foreseen(file, every, sentry, *about, as_json=as_json)
                 return None
         if summary and (as_json or plot):
@@ -185,26 +184,23 @@ def monitor(
             digest = sha256(guard.read_bytes()).hexdigest() if guard and is_other else None
             basics = {"interval": interval, "brakes": brakes} if guard is None else {}
             ends = [rows, reader["episode"]] if "episode" in reader else rows
-            how = {"mode": mode, "learn": learn, "tolerance": tolerance, "episode": ends}
-            how["false_a_day"] = false_a_day
+            ways = {"mode": mode, "learn": learn, "tolerance": tolerance, "episode": ends}
+            ways["false_a_day"] = false_a_day
             columns = {k: v for k, v in reader.items() if k != "topics"}
-            keeper = State(state, {"guard": digest, **columns, **basics, **how, **system})
+            keeper = State(state, {"guard": digest, **columns, **basics, **ways, **system})
             stack.callback(keeper.close)
         elif learn and not summary:
             warn("nothing of what is learnt is saved; --state FILE saves it")
-        failed = new_guard.failed if new_guard else None
-        sentry = fresh() if keeper is None else keeper.guard(fresh, failed)
-        prepare(sentry, mode, tolerance, alarms, audit, stack, learn=learn)
+        sentry = make() if keeper is None else keeper.guard(make, failed)
+        prepare(sentry, mode, tolerance, alarms)
+        sentry.learn = learn
+        if audit is not None:
+            sentry.audit = stack.enter_context(AuditLog(audit, sync="episode"))
         if not (is_log or traffic):
             if observe is None or sentry.variables != VARIABLES:  # cars' may have other names
                 observe = options.quoted(sentry.variables or VARIABLES)
             slots = Slots(options.reading_of(**{**reader, "observe": observe, "dt": None}))
         decider = Decider(sentry, episode=rows, slots=slots)
-        notice = assumptions(brakes, accepted_risk)
-        if guard is not None:
-            notice = f"assumed: what {guard} was given and has learnt"
-        if new_guard:
-            notice = f"a guard of {', '.join(sentry.variables)} learns from what comes"
         if slots is not None and reader:
             si = "; in JSON all but its column of the time is in the SI" * ("unit" in reader)
             notice += f"; rows are read as in a log: {options.typed(reader)}{si}"

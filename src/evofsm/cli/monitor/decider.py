@@ -5,11 +5,9 @@ from __future__ import annotations
 import logging
 import math
 import re
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack
 from itertools import islice
-from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
@@ -30,7 +28,6 @@ from evofsm.fsm import EvolvingFSM
 from evofsm.fsm.validation import probability
 from evofsm.guard import ActionReviser, BoxActions, Choices, Foresight, Guard, LearntRisk, Mode
 from evofsm.guard.api import Proposal, Revision
-from evofsm.guard.audit_log import AuditLog
 from evofsm.guard.reviser import is_spoken, make_usable
 from evofsm.io.logs import Condition
 from evofsm.io.tables import date
@@ -66,9 +63,10 @@ class Decider:
         self.n = 0  #: decisions so far
         self.rows = 0  #: decisions of the episode under way; 0 where none is
         self.decided_on: Row | None = None  #: latest
+        self._alarm = False
         self._recent: deque[tuple[Message, Answer]] = deque(maxlen=_RECENT)
         self._next: int | None = None  # of the recent ones, where they are being sent again
-        self._said_often = self._said_fast = self._has_failed = self._alarm = self._turns = False
+        self._said: set[str] = set()  # what is said once, some of it in each episode
         reviser = guard.reviser
         judge = reviser.risk if isinstance(reviser, ActionReviser) else None
         self._mode = reviser.mode if isinstance(reviser, ActionReviser) else Mode.ACT
@@ -98,30 +96,28 @@ class Decider:
             if (body := self.csv.read(line)) is None:
                 return self._of("waiting", alarm=self._alarm, reason=messages.NO_ROW)
             message = self.form.read(body)
-            beyond = self.guard.beyond(np.array(message.observation or (), np.float64))
-            if beyond is not None:
-                raise MessageError(*beyond, message.time)
             self._next = self._sent_before(message)
             if self._next is not None:
                 return self._recent[self._next][1]
             if isinstance(message, Row):
-                change = self.slots.change(message, self.latest)
-                if isinstance(self.latest, Row) and not change:
-                    _refuse_stale(message, self.latest)
-                self.slots.refuse(message)
-                if self.slots.is_over(message) and not change:
-                    text = f"comes after its {self.slots.step:g} s were decided on, as nothing came"
-                    raise MessageError("time", text, message.time)
-                if self.slots.step and (message.ahead or not message.observation):
-                    raise MessageError("objects", "are not resampled; send rows of the variables")
+                self._refuse(message)
         except MessageError as error:
             place = self.csv.place if self.csv.in_csv or error.about == "line" else ""
             return self.error(error.about, f"{place}{error}", error.time)
-        self.keep(message)  # before it: an audit log knows nothing that is not kept
         try:
-            return self.act(message)
+            return self._accept(message)
         except Exception as error:  # an end that the guard cannot take
             return self.error("end", f"was refused: {type(error).__name__}: {error}")
+
+    def lapse(self) -> Answer | None:
+        """Decide on what waits, as nothing came for long; None where nothing waits."""
+        return self._accept(Pause()) if self.slots.waiting else None
+
+    def _accept(self, told: Taken) -> Answer:
+        """Keep it, and act on it."""
+        self.keep(told)  # before it: an audit log knows nothing that is not kept
+        try:
+            return self.act(told)
         finally:
             self.keep(None)
 
@@ -161,10 +157,23 @@ class Decider:
             return is_back and told.time < self.latest.time - _LATE
         return is_back or isinstance(before[-1], End)
 
+    def _refuse(self, row: Row) -> None:
+        """Raise where a row is no newer than what was accepted before, or cannot be compared."""
+        self.slots.refuse(row)
+        latest = self.latest
+        if self.slots.change(row, latest):
+            return
+        if isinstance(latest, Row) and latest.time - _LATE <= row.time <= latest.time:
+            text = f"comes after {date(latest.time, ' s')}: late rows are left out"
+            text = text if row.time < latest.time else "was decided on before, with other values"
+            raise MessageError("time", f"{date(row.time, ' s')} {text}", row.time)
+        if self.slots.is_over(row):
+            text = f"comes after its {self.slots.step:g} s were decided on, as nothing came"
+            raise MessageError("time", text, row.time)
+
     def error(self, about: str, what: str, time: float | None = None) -> Answer:
         """What is answered where a message is refused."""
-        when = {} if time is None else {"time": time}
-        return self._of("error", **when, about=about, error=what)
+        return self._of("error", time=time, about=about, error=what)
 
     def _of(self, kind: str, **said: Any) -> Answer:
         return {"schema": messages.SCHEMA, "kind": kind, "n": self.n, **said}
@@ -173,31 +182,65 @@ class Decider:
         """Take in what was accepted, and answer it."""
         if isinstance(told, Pause):
             return dict(self._waited(early=True).get("last", {}))
-        remark = "" if self.rows or self.slots.waiting else self.slots.lacking(told)  # once
-        last = Answer()
-        if change := self.slots.change(told, self.latest):
-            remark, last = f"{change}: a new episode", self._waited()
-            if self.rows:
-                self._end_unasked()
-            if isinstance(self._before(told), Row) and not self._turns:
-                self._turns = True  # once
-                _log.warning("%s; rows of several in turn need a monitor for each", remark)
+        last, remark = Answer(), ""
+        if why := self._ends_before(told):
+            last, remark = self._waited(), f"{why}: a new episode"
+            self._end_unasked()
+        elif not (self.rows or self.slots.waiting):  # once
+            remark = self.slots.lacking(told)
         answer = last | (self._ended(told) if isinstance(told, End) else self._taken(told))
-        if remark:
-            answer["note"] = "; ".join(filter(None, [answer.get("note"), remark]))
+        if note := "; ".join(filter(None, [remark, answer.get("note")])):
+            answer["note"] = note
         self._recent.append((told, answer))
         if self.rows >= self.episode and (not answer.get("alarm") or self.rows >= 2 * self.episode):
             self._end_unasked()
         return answer
 
-    def lapse(self) -> Answer | None:
-        """Decide on what waits, as nothing came for long; None where nothing waits."""
-        if not self.slots.waiting:
-            return None
-        self.keep(Pause())
-        answer = self.act(Pause())
-        self.keep(None)
-        return answer
+    def end(self, failed: bool = False, observation: Any = None) -> None:
+        """End the episode under way."""
+        self._without_lost_audit(lambda: self.guard.end(failed, observation))
+        self.rows, self._alarm = 0, False
+        self._said -= {"often", "fast"}
+
+    def _end_unasked(self) -> None:
+        """The same where nobody waits for an answer to it; what somebody's judge raises is said."""
+        try:
+            if self.rows:
+                self.end()
+        except Exception:
+            _log.exception("an episode could not be ended")
+            self.rows = 0
+
+    @property
+    def latest(self) -> Message | None:
+        """What was accepted latest."""
+        return self._recent[-1][0] if self._recent else None
+
+    def _before(self, told: Message) -> Message | None:
+        """What came latest; of several that take turns, what came of its own."""
+        messages = (message for message, _ in reversed(self._recent))
+        return next((m for m in messages if not self.slots.change(told, m)), None)
+
+    def _ends_before(self, told: Message) -> str:
+        """What tells that the episode under way was over before a row came; or nothing."""
+        latest = self.latest
+        if not (isinstance(told, Row) and isinstance(latest, Row)):
+            return ""
+        if change := self.slots.change(told, latest):
+            if isinstance(self._before(told), Row) and "turns" not in self._said:
+                self._said.add("turns")
+                _log.warning("%s; rows of several in turn need a monitor for each", change)
+            return change
+        step, hole = told.time - latest.time, self.slots.hole
+        if not (self.rows or self.slots.waiting) or self._left_out(told):
+            return ""
+        if step < 0.0:
+            return f"time went back from {date(latest.time, ' s')}"
+        if told.observation and told.ahead != latest.ahead:
+            return "another one is ahead"
+        if hole is not None and step > max(hole, HOLE * self.guard.interval):
+            return f"{step:.3g} s without a row (--hole {hole:g}s)"
+        return ""
 
     def _waited(self, *, early: bool = False) -> Answer:
         """What is decided on rows that waited, if there are some, as the entry of an answer."""
@@ -210,93 +253,74 @@ class Decider:
             self.end(told.failed, _numbers(told.observation))
         return self._of("end", failed=told.failed, **last)
 
-    def _before(self, row: Message) -> Message | None:
-        """What came latest; of several that take turns, what came of its own."""
-        messages = (message for message, _ in reversed(self._recent))
-        return next((m for m in messages if not self.slots.change(row, m)), None)
-
     def _taken(self, row: Row) -> Answer:
         """What a row brings, as it would in a log."""
-        slots, before = self.slots, self._before(row)
-        free, fails = self._free(row), slots.fails(row)
-        counts = not free and slots.counts(row)
-        if fails or not counts:
-            is_new = fails and not slots.fails(before)
-            if is_new:
-                slots.leave_out(row)
-            last, was = self._waited(), bool(self.rows)
-            is_end = was or (is_new and counts)
-            if is_end:
-                self.end(is_new, _numbers(row.observation) if is_new and counts else None)
-            columns = slots.columns
-            why = f"--failed {columns.failed}" if fails else free or f"not --where {columns.where}"
-            action = {"reason": why} if self._is_alone else self._unjudged(row, why)
-            verdict = {"failed": is_new} if is_end else {"alarm": False}
-            kind = "end" if is_end else "waiting"
-            return self._of(kind, time=row.time, **verdict, **action, **last)
-        if not slots.step:
-            return self._decided(row)
-        if (whole := slots.add(row)) is not None:
-            return self._decided(whole)
-        return self._of("waiting", time=row.time, alarm=self._alarm)
+        slots, why, fails = self.slots, self._left_out(row), self.slots.fails(row)
+        if not (why or fails):
+            whole = slots.add(row) if slots.step else row
+            if whole is not None:
+                return self._decided(whole)
+            return self._of("waiting", time=row.time, alarm=self._alarm)
+        is_new = fails and not slots.fails(self._before(row))
+        if is_new:
+            slots.leave_out(row)
+        is_last = is_new and not why  # of an episode, which has rows or not
+        last, is_end = self._waited(), bool(self.rows) or is_last
+        if is_end:
+            self.end(is_new, _numbers(row.observation) if is_last else None)
+        why = f"--failed {slots.columns.failed}" if fails else why
+        action = {"reason": why} if self._is_alone else self._unjudged(row, why)
+        verdict = {"failed": is_new} if is_end else {"alarm": False}
+        return self._of("end" if is_end else "waiting", time=row.time, **verdict, **action, **last)
 
-    @property
-    def latest(self) -> Message | None:
-        """What was accepted latest."""
-        return self._recent[-1][0] if self._recent else None
-
-    def end(self, failed: bool = False, observation: Any = None) -> None:
-        """End the episode under way."""
-        self._without_lost_audit(lambda: self.guard.end(failed, observation))
-        self.rows, self._said_often, self._said_fast = 0, False, False
-        self._alarm = False
-
-    def _end_unasked(self) -> None:
-        """The same where nobody waits for an answer to it; what somebody's judge raises is said."""
-        try:
-            self.end()
-        except Exception:
-            _log.exception("an episode could not be ended")
-            self.rows = 0
+    def _left_out(self, row: Row) -> str:
+        """Why a row does not count: nobody is ahead, --no-leader or --where says so; or nothing."""
+        columns, latest = self.slots.columns, self.latest
+        unseen = [place for place, value in enumerate(row.observation or ()) if value is None]
+        is_blind = self.form.variables == VARIABLES and unseen == [0, 2]
+        if (is_blind and columns.no_leader == "end") or self.slots.holds("--no-leader", row):
+            return f"--no-leader {columns.no_leader}"
+        if is_blind:  # from the first row of a drive on
+            is_first = not isinstance(latest, Row) or row.time < latest.time
+            if is_first or _NOBODY in self._recent[-1][1].get("reason", ""):
+                return _NOBODY
+        return f"not --where {columns.where}" * (self.slots.holds("--where", row) is False)
 
     def _decided(self, row: Row) -> Answer:
-        before, self.decided_on = self.decided_on, row
-        notes = self._notes(row, before) + self._odd_speeds(row)
+        if row.observation is None:  # whoever was followed is gone
+            self._end_unasked()
+        notes, self.decided_on = [*self._notes(row)], row
         note = {"note": "; ".join(notes)} if notes else {}
         self.n += 1
-        leader = {} if row.ahead is None else {"ahead": row.ahead}
         if row.observation is None:  # nothing is ahead: whatever is wanted is done
             body = self._unjudged(row, "nothing is ahead in the lane") | dict.fromkeys(_RISKS)
-            body |= {"proposed": plain(row.proposal), "advised": body["executed"]}
-            body |= {"alarm": False, "mode": self._mode.value}
-            return self._of("decision", time=row.time, ahead=None, **body, **note)
-        try:
-            revision = self._revision(row)
-        except Exception as error:  # whatever a judge of somebody's own raises
-            if not self._has_failed:  # once, as it may fail at each row
-                _log.exception("the guard failed at %s s", row.time)
-            self._has_failed = True
-            return self.error("guard", f"failed: {type(error).__name__}: {error}", row.time)
-        self.rows += 1
+            body |= {"proposed": plain(row.proposal), "advised": body["executed"], "ahead": None}
+        else:
+            try:
+                revision = self._revision(row)
+            except Exception as error:  # whatever a judge of somebody's own raises
+                if "failed" not in self._said:  # once, as it may fail at each row
+                    _log.exception("the guard failed at %s s", row.time)
+                self._said.add("failed")
+                return self.error("guard", f"failed: {type(error).__name__}: {error}", row.time)
+            self.rows += 1
+            self._alarm = self._is_alarm(revision)
+            body = self._revised(row, revision)
+        on = {"alarm": self._alarm, "mode": self._mode.value}
+        return self._of("decision", time=row.time, **body, **on, **note)
+
+    def _revised(self, row: Row, revision: Revision) -> Answer:
+        """What was decided on a row, and in a scene whom about."""
         low, high = revision.interval
         parts = {**revision._asdict(), "risk_low": low, "risk_high": high}
         body = {name: plain(parts[name]) for name in ("proposed", "executed", "advised", *_RISKS)}
-        self._alarm = self._is_alarm(revision)
         names = ("", *row.objects)
         reason = re.sub(r"(?<=\bobject )\d+", lambda k: names[int(k[0])], revision.reason)
-        body |= {"reason": reason, "alarm": self._alarm, "mode": self._mode.value}
-        return self._of("decision", time=row.time, **leader, **self._worst(row), **body, **note)
-
-    def _free(self, row: Row) -> str:
-        """Why nobody counts as ahead: --no-leader, or none was seen in this drive; or nothing."""
-        rule, latest = self.slots.columns.no_leader, self.latest
-        unseen = [place for place, value in enumerate(row.observation or ()) if value is None]
-        is_blind = self.form.variables == VARIABLES and unseen == [0, 2]
-        if (is_blind and rule == "end") or self.slots.holds("--no-leader", row):
-            return f"--no-leader {rule}"
-        is_first = not isinstance(latest, Row) or row.time < latest.time
-        is_first = is_first or _NOBODY in self._recent[-1][1].get("reason", "")
-        return _NOBODY * (is_blind and is_first)
+        ahead = {} if row.ahead is None else {"ahead": row.ahead}
+        if self.form.scenes:
+            worst = self.guard.reviser.risk.worst  # type: ignore[attr-defined]
+            ahead |= {"object": worst and names[worst.number], "role": worst and worst.role.value}
+        return {**body, "reason": reason, **ahead}
 
     def _unjudged(self, row: Row, why: str) -> Answer:
         """What is executed where nothing is judged, made usable as before a decision, and why."""
@@ -305,44 +329,21 @@ class Decider:
         executed = int(action) if isinstance(self.guard.actions, Choices) else plain(action)
         return {"executed": executed, "reason": "; ".join(filter(None, (remark, why)))}
 
-    def _worst(self, row: Row) -> Answer:
-        """Who of a scene the proposal is most dangerous with."""
-        if not self.form.scenes:
-            return {}
-        pair = self.guard.reviser.risk.worst  # type: ignore[attr-defined]
-        if pair is None:
-            return {"object": None, "role": None}
-        return {"object": row.objects[pair.number - 1], "role": pair.role.value}
-
-    def _notes(self, row: Row, latest: Row | None) -> list[str]:
-        """What is odd about when a row comes, and what it follows; may end the episode."""
-        interval, hole = self.guard.interval, self.slots.hole
-        if latest is None or not self.rows:
-            return []
-        step = row.time - latest.time
-        if step < 0.0:
-            self._end_unasked()
-            return [f"time went back from {date(latest.time, ' s')}: a new episode"]
-        if row.ahead != latest.ahead:
-            self._end_unasked()
-            return ["another one is ahead: a new episode"] if row.observation else []
-        if hole is not None and step > max(hole, HOLE * interval):
-            self._end_unasked()
-            return [f"{step:.3g} s without a row: a new episode (--hole {hole:g}s)"]
+    def _notes(self, row: Row) -> Iterator[str]:
+        """What is odd about when a row comes, and its speeds; in an episode all but gaps once."""
+        interval, before = self.guard.interval, self.decided_on
+        step = row.time - before.time if before and self.rows else interval
         if step > HOLE * interval:
-            return [f"{step:.3g} s without a row: nothing is learnt or carried across"]
-        if step < _OFTEN * interval and not self._said_often:
-            self._said_often = True
+            yield f"{step:.3g} s without a row: nothing is learnt or carried across"
+        if step < _OFTEN * interval and "often" not in self._said:
+            self._said.add("often")
             text = f"the guard was made for {interval:g} s: --resample {interval:g}s"
-            return [f"rows come every {step:.3g} s, but {text}"]
-        return []
-
-    def _odd_speeds(self, row: Row) -> list[str]:
-        """What can hardly be m/s; said once in an episode."""
+            yield f"rows come every {step:.3g} s, but {text}"
         variables = zip(self.form.variables, self._units, row.observation or (), strict=False)
         fast = [name for name, unit, z in variables if unit == "m/s" and abs(z or 0.0) > _FAST]
-        was_said, self._said_fast = self._said_fast, self._said_fast or bool(fast)
-        return [f"{fast[0]} is above {_FAST:g} m/s: is that km/h?"] if fast and not was_said else []
+        if fast and "fast" not in self._said:
+            self._said.add("fast")
+            yield f"{fast[0]} is above {_FAST:g} m/s: is that km/h?"
 
     def _revision(self, row: Row) -> Revision:
         proposal: Any = 0 if self._is_alone else row.proposal
@@ -391,36 +392,26 @@ class Decider:
         self.slots.waiting = msgspec.convert(memory["waiting"], list[Row])
         for message, answer in memory["recent"]:
             self._recent.append((msgspec.convert(message, Message), dict(answer)))
-        self.decided_on = self.latest if isinstance(self.latest, Row) else None
-
-
-def _refuse_stale(row: Row, latest: Row) -> None:
-    """Raise if it is no newer than the latest one, unless its sender began anew."""
-    if latest.time - _LATE <= row.time <= latest.time:
-        text = f"comes after {date(latest.time, ' s')}: late rows are left out"
-        text = text if row.time < latest.time else "was decided on before, with other values"
-        raise MessageError("time", f"{date(row.time, ' s')} {text}", row.time)
 
 
 def _moving(row: Row, recent: Iterator[Message]) -> NDArray[np.float64]:
     """A scene with the rates that were not sent: since scenes before, latest first, else 0."""
-    rows = _table(row)
-    scenes: list[tuple[float, dict[str, NDArray[np.float64]]]] = []
+    tracks = defaultdict[str, list[tuple[float, NDArray[np.float64]]]](list)
     for scene in recent:
         if not isinstance(scene, Row) or scene.time >= row.time or scene.observation is None:
             break
-        objects = zip(("", *scene.objects), _table(scene), strict=False)
-        scenes.append((row.time - scene.time, dict(objects)))
+        for name, values in zip(("", *scene.objects), _table(scene), strict=False):
+            tracks[name].append((row.time - scene.time, values))
         if row.time - scene.time >= _LATELY:
             break
-    for name, values in zip(("", *row.objects), rows, strict=False):
+    table = _table(row)
+    for name, values in zip(("", *row.objects), table, strict=False):
         for rate, number, least, most, lasts in _CHANGES:
             if math.isnan(values[rate]):
-                track = [(step, z[name][number]) for step, z in scenes if name in z]
-                step, then = track[-1 if lasts else 0] if track else (1.0, math.nan)
-                change = (values[number] - then) / max(step, lasts)
+                step, then = tracks[name][-1 if lasts else 0] if tracks[name] else (1.0, values)
+                change = (values[number] - then[number]) / max(step, lasts)
                 values[rate] = change if least <= abs(change) <= most else 0.0
-    return rows.ravel()
+    return table.ravel()
 
 
 def _table(row: Row) -> NDArray[np.float64]:
@@ -437,7 +428,7 @@ def _numbers(observation: tuple[float | None, ...] | None) -> list[float] | None
 
 
 def begun(
-    told: dict[str, Any],
+    told: Mapping[str, Any],
     reading: Mapping[str, Any],
     interval: float | None,
     tolerance: float | None,
@@ -446,24 +437,24 @@ def begun(
     """A guard that knows nothing yet, from what was told of a system."""
     if "observe" not in told:
         raise ValueError("say what is observed, the keys of rows: --observe temperature,load")
-    columns = reading_of(**{**reading, "observe": told.pop("observe"), "dt": None})
+    columns = reading_of(**{**reading, "observe": told["observe"], "dt": None})
+    acts = {name: part for name, part in told.items() if name != "observe"}
     names, scheme = columns.observe.names, columns.resample
     if (step := scheme.step if scheme else interval) is None:
         raise ValueError("say how often rows come [s]: --interval 1; or --resample 10s of jittered")
-    if not columns.acts and told:
+    if not columns.acts and acts:
         raise ValueError("--action '' says that nobody acts, and goes with no range of actions")
     if not columns.acts:
-        horizon, hold, false_a_day = alarms
-        judge = Foresight.from_zero(dt=step, names=names, horizon=horizon, hold=hold)
-        return guard_of_alarms(judge, false_a_day, EvolvingFSM(1, max_states=200), learn=True)
-    if not told:
+        judge = Foresight.from_zero(dt=step, names=names, horizon=alarms[0], hold=alarms[1])
+        return guard_of_alarms(judge, alarms, EvolvingFSM(1, max_states=200), learn=True)
+    if not acts:
         raise ValueError("say who acts: --low and --high, --n-actions; or --action '', if nobody")
-    for name in {"low", "high"} & {*told}:
+    for name in {"low", "high"} & {*acts}:
         try:
-            ends = [float(end) for end in told[name].split(",")]
+            ends = [float(end) for end in acts[name].split(",")]
         except ValueError:
-            raise ValueError(f"--{name} is {told[name]!r}; write a number, or -1,-1") from None
-        told[name] = ends if len(ends) > 1 else ends[0]
+            raise ValueError(f"--{name} is {acts[name]!r}; write a number, or -1,-1") from None
+        acts[name] = ends if len(ends) > 1 else ends[0]
     condition = Condition.parse(columns.failed or names[0])
 
     def failed(z: Any) -> bool:
@@ -471,26 +462,17 @@ def begun(
 
     is_told = columns.failed and {term.column for term in condition.terms} <= {*names}
     return Guard(
-        **told,
+        **acts,
         interval=step,
-        judge=LearntRisk(step, horizon=alarms[0], names=names, **told),
+        judge=LearntRisk(step, horizon=alarms[0], names=names, **acts),
         failed=failed if is_told else None,
         tolerance=TOLERANCE if tolerance is None else tolerance,
         mode=Mode.SHADOW,
     )
 
 
-def prepare(
-    guard: Guard,
-    mode: ModeName,
-    tolerance: float | None,
-    alarms: Alarms,
-    audit: Path | None,
-    stack: ExitStack,
-    *,
-    learn: bool,
-) -> None:
-    """Set how far it goes, whether it learns, and who writes it down."""
+def prepare(guard: Guard, mode: ModeName, tolerance: float | None, alarms: Alarms) -> None:
+    """Set how far it goes, and what it accepts."""
     refuse_other_limit(not isinstance(guard.judge, Foresight), alarms, tolerance)
     if isinstance(guard.judge, Foresight) and alarms[-1] is not None:
         guard.judge.stated = alarms[-1]
@@ -501,6 +483,3 @@ def prepare(
     elif mode != "act":
         name = type(guard.reviser).__name__
         raise ValueError(f"a {name} knows no --mode {mode}: what it says is executed")
-    guard.learn = learn
-    if audit is not None:
-        guard.audit = stack.enter_context(AuditLog(audit, sync="episode"))

@@ -101,7 +101,7 @@ class Form:
     def __init__(
         self, guard: Guard, others: Sequence[str] = (), clock: str = "time", unit: str = "s"
     ) -> None:
-        reviser = guard.reviser
+        self._guard, reviser = guard, guard.reviser
         #: Names of what is observed; empty where they have none, and come as a list.
         self.variables: tuple[str, ...] = guard.variables
         #: Whether the guard observes whole scenes.
@@ -113,16 +113,17 @@ class Form:
         several: Any = Annotated[list[_Seen], length]
         variables = dict.fromkeys(self.variables, _Seen) or {"observation": several}
         self._observed, self._others = list(variables), others
-        clocks = dict.fromkeys([clock, *clock.split(",")])  # of date and time of day
-        self._clocks = [name for name in clocks if name not in ("time", *variables, *others)]
-        self._form, self._unit = unit if "%" in unit else "", TIMES.get(unit, 1.0)
-        self._own_unit = self._unit if clock == "time" else 1.0
+        self._form, seconds = unit if "%" in unit else "", TIMES.get(unit, 1.0)
+        #: Where the time may stand, and how many seconds 1 is there.
+        self._clocks = {"time": seconds if clock == "time" else 1.0}
+        columns = (name for name in (clock, *clock.split(",")) if name not in (*variables, *others))
+        self._clocks |= {name: seconds for name in columns if name != "time"}
         action, self._is_box = _action(guard), isinstance(guard.actions, BoxActions)
         if isinstance(guard.actions, Choices) and guard.actions.n_actions == 1:  # nobody acts
             action = NotRequired[action]
         also = dict.fromkeys(others, NotRequired[float | bool | str | None])
         also["schema"] = NotRequired[Literal[1]]
-        when = dict.fromkeys(["time", *self._clocks], NotRequired[_Number | str])
+        when = dict.fromkeys(self._clocks, NotRequired[_Number | str])
         self._row = _Keys("Row", {**when, "proposal": action, **variables, **also})
         scene = {"time": _Number, "proposal": action, "ego": _Vehicle, "objects": list[_Vehicle]}
         self._scene = _Keys("Scene", {**scene, "schema": also["schema"]})
@@ -134,40 +135,46 @@ class Form:
         self._keys = {kind: {name: name for name in kind.__annotations__} for kind in kinds}
 
     def read(self, line: bytes | dict[str, Any]) -> Message:
-        """The message on a line, or with these keys."""
+        """The message on a line, or with these keys, of which the time is in seconds."""
         body = line if isinstance(line, dict) else _parsed(line)
+        try:
+            message = self._message(body, in_si=body is line)
+            observation = np.array(message.observation or (), np.float64)
+            if (beyond := self._guard.beyond(observation)) is not None:
+                raise MessageError(*beyond)
+        except MessageError as error:
+            error.time = _time(body)
+            raise
+        return message
+
+    def _message(self, body: dict[str, Any], *, in_si: bool) -> Message:
         kind = self._scene if self.scenes or body.keys() & {"ego", "objects"} else self._row
         kind = self._end if "end" in body else kind
         keys, wish = self._keys[kind], body.get("proposal")
         if isinstance(wish, list) and len(wish) == 1 and not self._is_box:
             body["proposal"] = wish[0]  # as of Gymnasium's Box(1,)
+        if unknown := [name for name in body if name not in keys]:
+            raise _unknown(unknown[0], keys)
         try:
-            if unknown := [name for name in body if name not in keys]:
-                raise _unknown(unknown[0], keys)
-            try:
-                fields = msgspec.convert({keys[name]: body[name] for name in body}, kind)
-            except msgspec.ValidationError as error:
-                raise _refused(body, str(error)) from None
-            if isinstance(wish, list) and self._is_box:
-                fields["proposal"] = tuple(fields["proposal"])
-            if body is not line and isinstance(fields.get("time"), float | int):  # CSV is converted
-                fields["time"] *= self._own_unit
-            if kind is self._end:
-                return self._of_end(fields)
-            if (time := self._when(fields)) is None:
-                clocks = "".join(f", or {name!r}" for name in self._clocks)
-                raise MessageError("time", f"is missing{clocks}; every message of its kind has it")
-            if kind is self._scene:
-                return self._of_scene(fields, time)
-            also = {name: fields.get(name) for name in self._others}
-            return Row(time, self._seen(fields), fields.get("proposal", 0), told=also)
-        except MessageError as error:
-            error.time = _time(body)
-            raise
+            fields = msgspec.convert({keys[name]: body[name] for name in body}, kind)
+        except msgspec.ValidationError as error:
+            raise _refused(body, str(error)) from None
+        time = self._when(fields, in_si=in_si)
+        if kind is self._end:
+            return self._of_end(fields, time)
+        if time is None:
+            clocks = "".join(f", or {name!r}" for name in self._clocks if name != "time")
+            raise MessageError("time", f"is missing{clocks}; every message of its kind has it")
+        proposal = fields.get("proposal", 0)
+        proposal = tuple(proposal) if isinstance(proposal, list) else proposal
+        if kind is self._scene:
+            return self._of_scene(fields["ego"], fields["objects"], time, proposal)
+        also = {name: fields.get(name) for name in self._others}
+        return Row(time, self._seen(fields), proposal, told=also)
 
-    def _when(self, told: dict[str, Any]) -> float | None:
+    def _when(self, told: dict[str, Any], *, in_si: bool) -> float | None:
         """The time of a message [s], as it or a log has it."""
-        times = {n: told[n] for n in ("time", *self._clocks) if told.get(n) is not None}
+        times = {name: told[name] for name in self._clocks if told.get(name) is not None}
         name, time = next(iter(times.items()), ("time", None))
         if isinstance(time, str):
             try:
@@ -175,7 +182,7 @@ class Form:
             except ValueError:
                 fault = f"is {_shown(time)}; it must be float [s], or a date as logs have them"
                 raise MessageError(name, fault) from None
-        seconds = time if time is None or name == "time" else time * self._unit
+        seconds = time if time is None or in_si else time * self._clocks[name]
         if seconds is not None and abs(seconds) >= _LATEST:
             raise MessageError(name, f"is {time:.15g}: milliseconds? It must be in seconds")
         return seconds
@@ -183,43 +190,36 @@ class Form:
     def _seen(self, told: dict[str, Any]) -> tuple[float | None, ...]:
         return tuple(told[name] for name in self.variables) or tuple(told["observation"])
 
-    def _of_end(self, told: dict[str, Any]) -> End:
+    def _of_end(self, told: dict[str, Any], time: float | None) -> End:
         if not told["end"]:
             raise MessageError("end", "is false; it must be true")
         omissions = [name for name in self._observed if name not in told]
         if 0 < len(omissions) < len(self._observed):
             raise MessageError(omissions[0], "is missing; a variable that was not seen is null")
-        observation = None if omissions else self._seen(told)
-        return End(told.get("failed", False), observation, self._when(told))
+        return End(told.get("failed", False), None if omissions else self._seen(told), time)
 
-    def _of_scene(self, told: dict[str, Any], time: float) -> Row:
+    def _of_scene(self, ego: _Vehicle, cars: list[_Vehicle], time: float, proposal: Any) -> Row:
         if not (self.scenes or self.variables == VARIABLES):
             raise MessageError(
                 "objects", "are for guards of car following; send a row of this guard's variables"
             )
-        ego, cars = told["ego"], told["objects"]
-        _refuse_nowhere(ego, "ego")
         if ego.vx < REVERSE:
             raise MessageError("ego.vx", f"is {ego.vx:g}; x counts along its direction of travel")
+        _refuse_unplaced("ego", ego, ego)
         for k, car in enumerate(cars):
-            where = f"objects[{k}]"
-            _refuse_nowhere(car, where)
-            if car.id is UNSET:
-                raise MessageError(f"{where}.id", "is missing; it must be an int or a text")
-            in_lanes = car.lane is not UNSET and ego.lane is not UNSET
-            if not in_lanes and (car.y is UNSET or ego.y is UNSET):
-                fault = "is given for it or for ego, but not for both; nor is y"
-                raise MessageError(f"{where}.lane", fault)
-        proposal = told.get("proposal", 0)
+            _refuse_unplaced(f"objects[{k}]", car, ego)
         if self.scenes:
             objects = [_object(car, f"objects[{k}]") for k, car in enumerate(cars)]
             scene = Scene(_object(ego, "ego"), objects)
             names = tuple(obj.id for obj in scene.objects[1 : _MOST_OBJECTS + 1])
             rows = (None if math.isnan(z) else z for z in scene.rows(_MOST_OBJECTS).tolist())
             return Row(time, tuple(rows), proposal, objects=names)
-        if (ahead := _nearest_ahead(ego, cars)) is None:
+        # The closest in the own lane whose middle is ahead.
+        ahead = (car for car in cars if car.x > ego.x and _in_lane(ego, car))
+        gaps = ((car.x - ego.x - 0.5 * (ego.length + car.length), car) for car in ahead)
+        if (nearest := min(gaps, key=itemgetter(0), default=None)) is None:
             return Row(time, None, proposal)
-        gap, car = ahead
+        gap, car = nearest
         return Row(time, (gap, ego.vx, car.vx), proposal, None if car.id is UNSET else car.id)
 
 
@@ -237,9 +237,15 @@ def _action(guard: Guard) -> Any:
 # -- Scenes ---------------------------------------------------------------------------------------
 
 
-def _refuse_nowhere(car: _Vehicle, where: str) -> None:
+def _refuse_unplaced(where: str, car: _Vehicle, ego: _Vehicle) -> None:
+    """Raise where a vehicle has no name, or it cannot be told whether ego is in its lane."""
     if car.lane is UNSET and car.y is UNSET:
         raise MessageError(f"{where}.y", "is missing, and so is lane; one of them is needed")
+    if car.id is UNSET and car is not ego:
+        raise MessageError(f"{where}.id", "is missing; it must be an int or a text")
+    if UNSET in (car.lane, ego.lane) and UNSET in (car.y, ego.y):
+        fault = "is given for it or for ego, but not for both; nor is y"
+        raise MessageError(f"{where}.lane", fault)
 
 
 def _object(car: _Vehicle, where: str) -> Object:
@@ -249,16 +255,6 @@ def _object(car: _Vehicle, where: str) -> Object:
     name = where if car.id is UNSET else str(car.id)
     vy, ax = (math.nan if rate is UNSET else rate for rate in (car.vy, car.ax))
     return Object(name, car.x, car.y, car.vx, vy, car.length, car.width, ax)
-
-
-def _nearest_ahead(ego: _Vehicle, objects: list[_Vehicle]) -> tuple[float, _Vehicle] | None:
-    """The closest object in the own lane whose middle is ahead, after the gap to it [m]."""
-    ahead = [
-        (away - 0.5 * (ego.length + car.length), car)
-        for car in objects
-        if (away := car.x - ego.x) > 0.0 and _in_lane(ego, car)
-    ]
-    return min(ahead, key=itemgetter(0), default=None)
 
 
 def _in_lane(ego: Any, car: Any) -> bool:

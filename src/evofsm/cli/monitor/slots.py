@@ -13,7 +13,7 @@ from typing import Any
 
 from evofsm.cli.monitor.messages import LONGEST, NO_ROW, Message, MessageError, Row
 from evofsm.io import LogColumns, tables
-from evofsm.io.logs import units_of
+from evofsm.io.logs import Resample, units_of
 from evofsm.io.tables import Dialect, decoded, explained, is_date, is_number, is_value
 
 _BECOME: dict[str, Any] = {"mean": fmean, "last": itemgetter(-1), "max": max, "min": min}
@@ -24,28 +24,28 @@ class Slots:
 
     def __init__(self, columns: LogColumns | None = None) -> None:
         self.columns = columns = columns or LogColumns()
-        scheme = columns.resample
-        self.step = 0.0 if scheme is None else scheme.step  #: [s]; 0 where rows stay as they are
+        #: [s], 0 where rows stay as they are; and what the values of a column become.
+        self.step, self._how = columns.resample or Resample(0.0)
         self.hole = columns.longest_hole  #: up to which a hole costs no episode [s]
         self.names = columns.observe.names
-        self._how = {} if scheme is None else scheme.how
         self._conditions = columns.conditions
-        every = [term for c in self._conditions.values() for term in c.terms]
-        self.compared = [term.column for term in every if term.of_number]  #: with a number
-        extra = dict.fromkeys([*(t.column for t in every), *(columns.episode or ())])
+        self._terms = [(o, term) for o, c in self._conditions.items() for term in c.terms]
+        extra = dict.fromkeys([*(t.column for _, t in self._terms), *(columns.episode or ())])
         #: Keys that rows may have beside the guard's variables, for conditions and episodes.
         self.keys = tuple(name for name in extra if name not in (*self.names, columns.action))
+        self.compared = [t.column for _, t in self._terms if t.of_number]  #: with a number
         #: Of the log: what the column of its time is called, how dates are written, or its unit.
         self.clock = columns.time, columns.units.get(columns.time, "s")
         self.waiting: list[Row] = []
         self._done = math.nan  # time of the slot that was decided on as nothing came
 
     def refuse(self, row: Row) -> None:
-        """Raise where a row tells of what a condition names what cannot be compared with it."""
-        for option, condition in self._conditions.items():
-            for term in condition.terms:
-                if fault := term.fault(row.told.get(term.column)):
-                    raise MessageError(term.column, f"{fault} ({option})", row.time)
+        """Raise where a row cannot be compared with a condition, or be one with others."""
+        for option, term in self._terms:
+            if fault := term.fault(row.told.get(term.column)):
+                raise MessageError(term.column, f"{fault} ({option})", row.time)
+        if self.step and (row.ahead or not row.observation):
+            raise MessageError("objects", "are not resampled; send rows of the variables", row.time)
 
     def lacking(self, row: Message) -> str:
         """What a row does not tell of what conditions name, in words."""
@@ -54,26 +54,21 @@ class Slots:
         options = " or ".join([*self._conditions, *["--episode"] * bool(self.columns.episode)])
         return f"no {names} in the row, which {options} names" * bool(names)
 
+    def holds(self, option: str, row: Message | None) -> bool | None:
+        """Whether a row meets the condition of an option; None where nothing is told of it."""
+        if (condition := self._conditions.get(option)) is None:
+            return None
+        values = self._values(row)
+        is_told = any(values.get(term.column) is not None for term in condition.terms)
+        return condition.holds_of(values) if is_told else None
+
     def fails(self, row: Message | None) -> bool:
         """Whether a row meets what tells of failures."""
-        if not isinstance(row, Row) or self.holds("--no-leader", row):
-            return False
-        return self.holds("--failed", row)
+        return bool(self.holds("--failed", row)) and not self.holds("--no-leader", row)
 
-    def counts(self, row: Row) -> bool:
-        """Whether it does, or is left out; what a row does not tell is no reason."""
-        return "--where" not in self._conditions or self.holds("--where", row, unknown=True)
-
-    def holds(self, option: str, row: Row, *, unknown: bool = False) -> bool:
-        """Whether a row meets the condition of an option; not where there is none."""
-        if (condition := self._conditions.get(option)) is None:
-            return False
-        values = self._values(row)
-        if unknown and all(values.get(term.column) is None for term in condition.terms):
-            return True
-        return condition.holds_of(values)
-
-    def _values(self, row: Row) -> dict[str, Any]:
+    def _values(self, row: Message | None) -> dict[str, Any]:
+        if not isinstance(row, Row):
+            return {}
         variables = dict(zip(self.names, row.observation or (), strict=False))
         return {self.columns.action: row.proposal, **variables, **row.told}
 
@@ -82,8 +77,8 @@ class Slots:
         if not (self.columns.episode and isinstance(row, Row) and isinstance(before, Row)):
             return ""
         now, then = self._values(row), self._values(before)
-        names = (name for name in self.columns.episode if now.get(name) != then.get(name))
-        return ", ".join(f"{name} {now.get(name)} after {then.get(name)}" for name in names)
+        changes = (name for name in self.columns.episode if now.get(name) != then.get(name))
+        return ", ".join(f"{name} {now.get(name)} after {then.get(name)}" for name in changes)
 
     def is_over(self, row: Row) -> bool:
         """Whether its step was decided on, as nothing came for long."""
@@ -91,9 +86,7 @@ class Slots:
 
     def add(self, row: Row) -> Row | None:
         """Let a row wait; what waited is returned as one, if it is of another step."""
-        before = None
-        if self.waiting and self._time(row) != self._time(self.waiting[0]):
-            before = self.take()
+        before = None if self._is_of_step(row) else self.take()
         self.waiting.append(row)
         return before
 
@@ -113,8 +106,12 @@ class Slots:
 
     def leave_out(self, row: Row) -> None:
         """Leave out what waits of the step of a row with which it failed: it is no whole one."""
-        if self.waiting and self._time(row) == self._time(self.waiting[0]):
+        if self._is_of_step(row):
             self.waiting.clear()
+
+    def _is_of_step(self, row: Row) -> bool:
+        """Whether it belongs to what waits."""
+        return bool(self.waiting) and self._time(row) == self._time(self.waiting[0])
 
     def _time(self, row: Row) -> float:
         return self.step * math.floor(row.time / self.step + 1e-9)

@@ -10,7 +10,6 @@ import logging
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from copy import copy
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,6 @@ from evofsm.guard import AuditLog, Guard, Head
 
 _log = logging.getLogger(__name__)
 
-_FILES = 100  # so many of the latest that were read are known again
 _EVERY = 600  # messages in the journal, from which on the guard is written as an episode ends
 _PROVENANCE = "monitor"
 
@@ -40,44 +38,40 @@ class State:
         journal = self.path.with_name(f"{self.path.name}.journal")
         self._journal = Journal(journal, "name another file")
         self._provenance: dict[str, Any] = {}
+        self._saved: dict[str, Any] = {}  # what stands beside the guard
         self._mark = 0
-        self._saved: Mapping[str, Any] = {}  # what stands beside the guard
         self._decider: Decider  # once it has begun
         self._count = 0  # messages in the journal
-        self._files: list[str] = []  # digests of what was read of each, in the end
-        self._read: dict[str, str] = {}  # of the file that is read, and of the one before it
+        self._files: list[str] = []  # digests of what was read of each
+        self._place: int | None = None  # among these, of the file that is read
 
     def guard(
         self, fresh: Callable[[], Guard], failed: Callable[[Any], bool] | None = None
     ) -> Guard:
         """The guard as it was saved; a fresh one where there is none."""
-        load = partial(Guard.load, self.path, failed=failed)
         journal, is_there = self._journal, self.path.exists()
         if is_there:
             self._provenance = dict(store.read_header(self.path).provenance)
-        entry = self._provenance.pop(_PROVENANCE, None)
-        if entry is None:
-            if journal.records:
-                raise ValueError(
-                    f"{journal.path} holds what came after a guard that is not in {self.path}; put "
-                    "that back, or delete the journal to begin anew"
-                )
-            return load() if is_there else fresh()
-        if changes := differences(entry["settings"], self.settings):
+        self._saved = self._provenance.pop(_PROVENANCE, {})
+        if not self._saved and journal.records:
+            raise ValueError(
+                f"{journal.path} holds what came after a guard that is not in {self.path}; put "
+                "that back, or delete the journal to begin anew"
+            )
+        if self._saved and (changes := differences(self._saved["settings"], self.settings)):
             raise ValueError(
                 f"{self.path} was saved with other settings: {changes}; go on with those, or name "
                 "another file"
             )
-        self._mark, self._saved = int(entry["mark"]), entry
-        if journal.settings.get("mark") not in (self._mark, self._mark - 1):
+        self._mark, self._files = self._saved.get("mark", 0), self._saved.get("files", [])
+        if self._saved and journal.settings.get("mark") not in (self._mark, self._mark - 1):
             raise ValueError(
                 f"{journal.path} is missing or empty: rows that came after {self.path} was saved "
                 "are lost; put it back, or give the guard as --guard and name another --state"
             )
-        rows = [record for record in journal.records if "read" in record]
-        self._files = [*entry.get("files", ()), *(row["before"] for row in rows if "before" in row)]
-        self._files += [row["read"] for row in rows[-1:]]
-        return load()
+        for record in journal.records:
+            self._have_read(*record.get("read", ()))
+        return Guard.load(self.path, failed=failed) if is_there else fresh()
 
     def begin(self, decider: Decider) -> int:
         """Go on where it was; returns the number of messages that were taken in again."""
@@ -102,7 +96,7 @@ class State:
 
     def pass_over(self, file: Path, decider: Decider) -> int:
         """Pass over the lines of a file that were taken in before; returns their length [byte]."""
-        csv, size, behind = copy(decider.csv), 0, 0
+        csv, size, behind, self._place = copy(decider.csv), 0, 0, len(self._files)
         with file.open("rb") as source:
             for line in source if self._files else ():
                 size += len(line)
@@ -110,11 +104,9 @@ class State:
                     csv.read(line.removesuffix(b"\n").removesuffix(b"\r"))
                 if csv.heard in self._files:  # with what it knows of names and units
                     decider.csv, behind = copy(csv), size
+                    self._place = self._files.index(csv.heard)
         if behind:
             warn(f"{file} was read before, up to {decider.csv.place}it goes on behind that")
-        self._read = {"read": decider.csv.heard}
-        if self._files:
-            self._read["before"] = self._files[-1]
         return behind
 
     def close(self) -> None:
@@ -133,13 +125,17 @@ class State:
             if self._decider.rows == 0 and (self.failure or self._count >= _EVERY):
                 self._try(self._save)
             return
-        if self._read:
-            self._read["read"] = self._decider.csv.heard
-        record = {"told": msgspec.to_builtins(told), **self._read}
-        self._read.pop("before", None)
+        record = {"told": msgspec.to_builtins(told)}
+        if self._place is not None:
+            record["read"] = self._place, self._decider.csv.heard
+            self._have_read(*record["read"])
         if not self.failure:
             self._try(lambda: self._journal.append(record, sync=False))
             self._count += 1
+
+    def _have_read(self, place: int = 0, *digests: str) -> None:
+        """Know again what was read of a file, in place of what was known of it before."""
+        self._files[place : place + len(digests)] = digests
 
     def _try(self, save: Callable[[], None]) -> None:
         """Decisions matter most: what fails is said, and gone on without until an episode ends."""
@@ -156,9 +152,8 @@ class State:
         """Write the guard, and begin a journal; the one before counts until it is written."""
         decider, mark = self._decider, self._mark + 1
         head = str(log.head) if isinstance(log := decider.guard.audit, AuditLog) else None
-        files = [*self._files, *self._read.values()][-_FILES:]
         entry = {"mark": mark, "settings": self.settings, "memory": decider.memory()}
-        entry |= {"audit": head, "files": files}
+        entry |= {"audit": head, "files": self._files}
         decider.guard.save(self.path, {**self._provenance, _PROVENANCE: entry})
         self._journal.begin_anew({"mark": mark})
         self._mark, self._count = mark, 0

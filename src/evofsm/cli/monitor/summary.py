@@ -127,7 +127,8 @@ def summary_of(decider: Decider, answers: Answers, title: str) -> Iterator[Rende
         pairs.append(("beware", f"it {useless}"))
     # A moment lasts while an alarm does; the highest risk within it stands for it.
     calm = (alarms == 0.0) & (np.diff(times // _MOMENT, prepend=0.0) != 0.0)
-    moments = np.cumsum((begins > 0.0) | calm | (np.diff(alarms, prepend=0.0) != 0.0))
+    first = (begins > 0.0) | calm | (np.diff(alarms, prepend=0.0) != 0.0)
+    moments = np.cumsum(first)
     long = np.bincount(moments, durations * alarms)[moments]
     if failed:
         before = long[failed]
@@ -144,13 +145,12 @@ def summary_of(decider: Decider, answers: Answers, title: str) -> Iterator[Rende
     # Whether it would alarm with another tolerance, one pass does not say.
     header = ("above", "times", "an hour", "of the time")
     yield table("\nBy risk of what was proposed", header, risk_rows, bold=bold)
-    order = np.lexsort((-risks, moments))
-    highest = order[np.unique(moments[order], return_index=True)[1]]
-    ranks = np.lexsort((-long[highest], -risks[highest]))[:_WORST]
+    parts = np.split(np.arange(len(rows)), np.flatnonzero(first)[1:])
+    highest = [int(part[risks[part].argmax()]) for part in parts]
     names = decider.form.variables or [f"{k + 1}" for k in range(len(rows[0].observation or ()))]
     names = () if decider.form.scenes else names[:_MOST_VARIABLES]
     episodes, worst = np.cumsum(begins), []
-    for at in highest[ranks].tolist():
+    for at in sorted(highest, key=lambda at: (-risks[at], -long[at]))[:_WORST]:
         if risks[at] or alarms[at]:
             cells = [*(rows[at].observation or ())[: len(names)], rows[at].proposal]
             texts = [
