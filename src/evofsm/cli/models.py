@@ -43,25 +43,22 @@ def load_model(place: Path) -> tuple[FSMModel, store.Header, Guard | None]:
         if path is None:
             raise FileNotFoundError(f"{place}: there is neither {' nor '.join(_MODELS)} in it")
         return load_model(path)
-    header, guard = store.read_header(place), None
+    header, guard, labels = store.read_header(place), None, Labels()
     if header.kind == "guard":
         guard = load_guard(place)
-        machine = guard.machine
+        machine, actions = guard.machine, getattr(guard.reviser, "actions", None)
         if machine is None:
             raise ValueError(f"{place}: this guard has no machine")
+        labels = getattr(guard.judge, "labels", labels)._replace(dt=guard.interval)
+        if isinstance(actions, IntervalActions):
+            labels = labels._replace(actions=actions)
     elif header.kind == "machine":
         machine = EvolvingFSM.load(place)
     else:
         return FSMModel.load(place), header, None
-    family = str(header.provenance.get("family"))
     if not machine.n_states:
         raise ValueError(f"{place} has seen nothing yet: an episode has to be over")
-    labels = getattr(guard and guard.judge, "labels", Labels())._replace(
-        dt=getattr(guard, "interval", None)
-    )
-    if isinstance(actions := getattr(guard and guard.reviser, "actions", None), IntervalActions):
-        labels = labels._replace(actions=actions)
-    if family in FAMILIES:
+    if (family := str(header.provenance.get("family"))) in FAMILIES:
         labels = load_family(family).labels
     return machine.model(**labels._asdict()), header, guard
 

@@ -39,25 +39,23 @@ class Text:
         return "".join(f"{visible(text)}\n" for part in parts for text in self._said(part)).encode()
 
     def _said(self, part: Answer) -> Iterator[str]:
-        time, since = part.get("time"), self._since
+        kind, time, since = part["kind"], part.get("time"), self._since
         if time is not None and since is not None and time < since:  # a clock that was set back
             since = self._since = None
         when = "" if time is None else f"{date(time)}  "
         after = "" if time is None or since is None else f" {span(time - since)}"
-        if part["kind"] == "error":
+        if kind == "error":
             yield f"{when}refused: {part['about']}: {part['error']}"
-        elif part["kind"] == "end":
+        elif kind == "end":
             self._since = None
             if part["failed"]:
                 text = " no alarm was on" if since is None else f"{after} after the alarm"
                 yield f"{when}failure,{text}"
-        elif part["kind"] == "decision" and part["alarm"] and since is None:
-            self._since = time
-            yield f"{when}alarm: {part['reason']}"
-        elif part["kind"] == "decision" and not part["alarm"] and since is not None:
-            self._since = None
-            yield f"{when}over, after{after}"
-        if part["kind"] == "decision":
+        elif kind == "decision":
+            if part["alarm"] == (since is None):
+                self._since = time if part["alarm"] else None
+                text = f"alarm: {part['reason']}" if part["alarm"] else f"over, after{after}"
+                yield f"{when}{text}"
             is_blind = part["risk_proposed"] is None and part.get("ahead", "") is not None
             if is_blind != self._is_blind:
                 yield f"{when}{part['reason'] if is_blind else 'the risk is known again'}"

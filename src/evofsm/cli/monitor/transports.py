@@ -179,11 +179,10 @@ class SocketTransport:
             if not lock.acquire(blocking=False):
                 continue
             with suppress(OSError):  # gone meanwhile
-                try:
-                    is_sent = peer.send(line, socket.MSG_DONTWAIT) == len(line)
-                except BlockingIOError:
-                    is_sent = False
-                if not is_sent:
+                count = 0
+                with suppress(BlockingIOError):
+                    count = peer.send(line, socket.MSG_DONTWAIT)
+                if count < len(line):
                     peer.shutdown(socket.SHUT_RDWR)
             lock.release()
 
