@@ -372,33 +372,33 @@ def check_out(out: Path | None, option: str = "--out") -> None:
 
 def told_of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> Iterator[str]:
     """Where it is, what it takes, and what it reckons with."""
-    assert guard.judge is not None
-    names = map(guard.judge.labels.variable, range(len(guard.variables)))
-    also = "" if isinstance(guard.judge, Foresight) else ", and proposal, the action"
+    judge = guard.judge
+    assert judge is not None
+    names = map(judge.labels.variable, range(len(guard.variables)))
+    also = "" if isinstance(judge, Foresight) else ", and proposal, the action"
     takes = f"evofsm monitor --guard {path} takes rows of {', '.join(['time [s]', *names])}{also}."
     yield f"The guard was saved to {path}. {takes}"
-    if isinstance(guard.judge, Foresight):
-        soon = f"up to {span(guard.judge.horizon * guard.judge.dt)} before a failure (--horizon)"
-        words, days = guard.judge.alarm_in_words, guard.judge.days
-        if (rate := guard.judge.alarm) is None:
+    if isinstance(judge, Foresight):
+        words, days = judge.alarm_in_words, judge.days
+        if (rate := judge.alarm) is None:
             text = f"one in {days:.2g} days is {1.0 / max(days, 1e-9):.2g} a day; fewer columns, or"
             hint = f" ({text} a longer log or --horizon?)" * ("chance" in words)
             yield f"It never alarms: {words}{hint}."
         else:
-            n = int(guard.judge.held_out[rate, 1])
+            soon = f"up to {span(judge.horizon * judge.dt)} before a failure (--horizon)"
+            n = int(judge.held_out[rate, 1])
             bound = outward(math.ceil, poisson_bounds(n)[1] / days, 2)
             text = f"{n:,} false in {days:.2g} days: it may be up to {bound:,g} a day (95 %)"
             yield f"{words.capitalize()} (--false-a-day), {soon}; {text}."
         judges = "evofsm monitor LOG --summary, with the same options, judges such alarms held out"
         yield f"{judges}; evofsm inspect {path} prints its states."
-        return
-    if not isinstance(guard.judge, LearntRisk):
+    elif isinstance(judge, LearntRisk):
+        note = "" if len(judge.state.forms) else " nothing yet"
+        yield f"It judges{note}: {judge.told_by_experience}."
+        if beyond:
+            yield f"It knows no action beyond --action-range, where {beyond:.1%} of the log's are."
+    else:
         yield f"It reckons with brakes of {brakes:g} m/s² of the own car (--brakes)."
-        return
-    note = "" if len(guard.judge.state.forms) else " nothing yet"
-    yield f"It judges{note}: {guard.judge.told_by_experience}."
-    if beyond:
-        yield f"It knows no action beyond --action-range, where {beyond:.1%} of the log's are."
 
 
 def document_of(learning: Learning, provenance: Mapping[str, Any]) -> dict[str, Any]:

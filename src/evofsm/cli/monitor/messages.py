@@ -166,7 +166,6 @@ class Form:
             clocks = "".join(f", or {name!r}" for name in self._clocks if name != "time")
             raise MessageError("time", f"is missing{clocks}; every message of its kind has it")
         proposal = fields.get("proposal", 0)
-        proposal = tuple(proposal) if isinstance(proposal, list) else proposal
         if kind is self._scene:
             return self._of_scene(fields["ego"], fields["objects"], time, proposal)
         also = {name: fields.get(name) for name in self._others}
@@ -230,7 +229,8 @@ def _action(guard: Guard) -> Any:
         return Annotated[int, Meta(ge=0, le=actions.n_actions - 1)] | None
     if isinstance(actions, BoxActions):
         components = int(np.size(actions.low))
-        return Annotated[list[_Number], Meta(min_length=components, max_length=components)] | None
+        length = Meta(min_length=components, max_length=components)
+        return Annotated[tuple[_Number, ...], length] | None
     return _Number | None
 
 
