@@ -67,14 +67,15 @@ def show_foreseen(
         rows = np.cumsum([len(e.times) for e in episodes])
         first = int((rows <= split * rows[-1]).sum())
         first_part, episodes = _of_two_rows(episodes[:first]), episodes[first:]
-        failures, later = (sum(e.failed for e in part) for part in (first_part, episodes))
-        fault = f"none failed in the first {split:.0%} of the rows, which it learns from, but "
-        fault += f"{later:,} later did (--split)"
-        if not (first_part and _of_two_rows(episodes)):
-            fault = "it takes two episodes at least, to learn and to judge"
-        if not failures + later:
+        fault = ""
+        if not any(e.failed for e in (*first_part, *episodes)):
             fault = "no episode failed, so there is nothing to foresee (--failed says what did)"
-        if not (failures and _of_two_rows(episodes)):
+        elif not (first_part and _of_two_rows(episodes)):
+            fault = "it takes two episodes at least, to learn and to judge"
+        elif not any(e.failed for e in first_part):
+            fault = f"none failed in the first {split:.0%} of the rows, which it learns from, but "
+            fault += f"{sum(e.failed for e in episodes):,} later did (--split)"
+        if fault:
             raise ValueError(f"{file}: {fault}")
         guard = guard_where_nobody_acts(first_part, labels, asked)
         learnt_from = "episode" if first == 1 else f"{len(first_part):,} episodes"
