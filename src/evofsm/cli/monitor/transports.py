@@ -85,9 +85,9 @@ class Server:
 
     def run(self, transport: Transport) -> None:
         """Serve until the input ends, SIGTERM, SIGHUP or Ctrl-C; no decision is cut short."""
-        threading.Thread(target=self._serve, args=(transport,), daemon=True).start()
         try:
             with asked_to_stop(signal.default_int_handler), suppress(KeyboardInterrupt):
+                threading.Thread(target=self._serve, args=(transport,), daemon=True).start()
                 while not self._over.wait(_LONGEST_WAIT):
                     if time.monotonic() - self._heard > (self.decider.slots.step or math.inf):
                         transport.send(self._lapse())
