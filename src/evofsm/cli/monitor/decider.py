@@ -293,8 +293,9 @@ class Decider:
         note = {"note": "; ".join(notes)} if notes else {}
         self.n += 1
         if row.observation is None:  # nothing is ahead: whatever is wanted is done
-            body = self._unjudged(row, "nothing is ahead in the lane") | dict.fromkeys(_RISKS)
-            body |= {"proposed": plain(row.proposal), "advised": body["executed"], "ahead": None}
+            body = {"ahead": None, **self._unjudged(row, "nothing is ahead in the lane")}
+            body |= {**dict.fromkeys(_RISKS), "proposed": plain(row.proposal)}
+            body["advised"] = body["executed"]
         else:
             try:
                 revision = self._revision(row)
@@ -320,7 +321,7 @@ class Decider:
         if self.form.scenes:
             worst = self.guard.reviser.risk.worst  # type: ignore[attr-defined]
             ahead |= {"object": worst and names[worst.number], "role": worst and worst.role.value}
-        return {**body, "reason": reason, **ahead}
+        return {**ahead, **body, "reason": reason}
 
     def _unjudged(self, row: Row, why: str) -> Answer:
         """What is executed where nothing is judged, made usable as before a decision, and why."""
