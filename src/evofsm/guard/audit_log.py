@@ -2,13 +2,12 @@
 
 docs/audit.md says what is in a record, a JSON object on a line of its own. ``hash``, its last, is
 the SHA-256 of the line up to the comma before it, and ``previous`` that of the record before (zeros
-for the first): a hash chain as in Haber and Stornetta (J. Cryptology 3, 1991). A row of ``before``
-is ``[time, observation]``, with the proposal after that if there was one, and with its mask if it
-had one.
+for the first): a hash chain as in Haber and Stornetta (J. Cryptology 3, 1991).
 
-An audit also decides again, without a world: what was observed and proposed is told to the guard
-that the log began with, and each decision must come out as it was recorded, to the last bit. So
-neither a forged decision nor a forged model hides behind a chain that was made anew.
+What a guard is told and decides is one record each, made by a `Recorder`. An audit also decides
+again, without a world: the guard that the log began with is told the same, and what a recorder
+then makes of it must be what was recorded, to the last bit. So neither a forged decision nor a
+forged model hides behind a chain that was made anew.
 """
 
 from __future__ import annotations
@@ -23,13 +22,13 @@ import platform
 import stat
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, suppress
 from datetime import UTC, datetime
 from hashlib import sha256
 from io import BytesIO, FileIO
+from operator import is_not
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import numba
@@ -51,20 +50,22 @@ _log = logging.getLogger(__name__)
 LOG_VERSION = 1
 #: What may be changed about a guard between episodes.
 SETTINGS = ("explaining", "interval", "learn", "shadow")
-# Most probable states of a belief that are written; decisions that are held back at most, which a
-# kill loses; and bytes of a line, which holds a machine at most.
+# Most probable states of a belief that are written; records of which one is forced onto the disk,
+# though nothing was to be said; and bytes of a line, which holds a machine at most.
 _STATES, _MOST_QUIET, _LONGEST_LINE = 3, 240, 1 << 26
 _SEAL, _LINE_END = b',"hash":"', b'"}\n'
-# What a decision tells as it is recorded elsewhere, too.
-_TOLD = tuple(name for name in RECORD if name not in ("time", "n_states", "risk_low", "risk_high"))
+_SEEN, _PROPOSED = {"observation", "time"}, {"observation", "time", "mask", "proposed"}
+# What is decided, as it is recorded elsewhere, too.
+_DECIDED = RECORD.keys() - _PROPOSED
 #: The names in a record of each kind, beside ``kind`` and ``clock``.
 FIELDS: Mapping[str, set[str]] = {
-    "start": {"about", "guard", "made_by", "reviser", "told_failures", "version"},
-    "begin": {"settings"},
-    "decision": {"before", "belief", "interval", "mask", "observation", "time", *_TOLD},
-    "quiet": {"before"},
+    "start": {"about", "guard", "made_by", "reviser", "settings", "told_failures", "version"},
+    "begin": set(),
+    "seen": _SEEN,
+    "quiet": _PROPOSED,
+    "decision": {*_PROPOSED, *_DECIDED, "belief"},
     "settings": {"settings"},
-    "end": {"before", "failed", "learnt", "observation", "score", "terminated"},
+    "end": {"failed", "learnt", "observation", "score", "terminated"},
 }
 
 
@@ -178,11 +179,11 @@ class Chain:
         self.size = 0  #: up to there [byte]
         self.half_written = 0  #: what a last line without an end holds [byte]
         self.finding: Finding | None = None  #: None where nothing was tampered with
-        self._kept = kept
+        self._kept = kept or NOTHING
 
     def records(self) -> Iterator[Record]:
         """The records, after which `finding` is known; a ValueError if there is none."""
-        has_head = self._kept in (None, NOTHING)
+        number, digest = self._kept
         file_lines = lines(self.path, _LONGEST_LINE)
         for line in file_lines:
             if not line.endswith(b"\n"):
@@ -192,11 +193,15 @@ class Chain:
             if record is None or (record.number - 1, record.previous) != self.head:
                 self.finding = self._broken(record, unseal(next(file_lines, b"")), file_lines)
                 return
+            if record.number == number and record.digest != digest:
+                why = "is not the one that the head is of: records up to it were written anew"
+                self.finding = Finding(number, f"record {number} {why}")
+                return
             self.head, self.size = Head(record.number, record.digest), self.size + len(line)
-            has_head = has_head or self._kept == self.head
             yield record
-        if not has_head and self._kept is not None:
-            self.finding = _against(self._kept, self.head)
+        if (last := self.head.number) < number:
+            why = f"the log ends with {last}: its end was cut off"
+            self.finding = Finding(last + 1, f"the head was record {number}, but {why}")
 
     def _broken(self, here: Record | None, after: Record | None, rest: Iterator[bytes]) -> Finding:
         """What is wrong with the line after the head, which holds ``here``."""
@@ -205,11 +210,9 @@ class Chain:
             raise ValueError(f"{self.path} is no audit log or journal: no line of it is a record")
         if here is None:
             why = "its hash is not that of what it says"
-        elif here.previous == self.head.digest:
-            why = f"it says that it is record {here.number}"
         elif here.number != at:
-            first = min(at, here.number)
-            why = "records were removed, moved, repeated or inserted"
+            first = at if here.previous == self.head.digest else min(at, here.number)
+            why = "records were removed, moved, repeated, inserted or numbered anew"
             return Finding(first, f"record {first} is not there once: {why}")
         elif at > 1 and (after is None or after.previous == here.digest):
             # The next record says that this one is as it was; of the last one nothing does.
@@ -233,16 +236,6 @@ def lines(path: Path, longest: int) -> Iterator[bytes]:
                 raise ValueError(f"{text}: is it another kind of file?")
             remainder -= len(line)
             yield line
-
-
-def _against(kept: Head, head: Head) -> Finding:
-    """Why a whole chain has not the head that was kept."""
-    last, number = head.number, kept.number
-    if number > last:
-        why = f"the head was record {number}, but the log ends with {last}: its end was cut off"
-        return Finding(last + 1, why)
-    why = f"record {number} is not the one that the head is of: records up to it were written anew"
-    return Finding(number, why)
 
 
 class Ledger:
@@ -339,7 +332,70 @@ class Ledger:
         return os.getpid() == self._owner and not self._file.closed
 
 
-class AuditLog(Ledger, AbstractContextManager["AuditLog"], DecisionLogger):
+class Recorder(DecisionLogger):
+    """Makes one record of each thing that a guard is told or decides: its kind, and what it says.
+
+    What was seen waits for what is decided on it, and is a record of its own where nothing is.
+    """
+
+    def __init__(self) -> None:
+        self._guard: Guard | None = None  # of the episode under way
+        self._learnt: dict[str, str] | None = None  # as the latest one ended
+        self._settings: dict[str, Any] = {}  # as they were recorded last
+        self._row: dict[str, Any] = {}  # what was seen, and not decided on yet
+
+    def _record(self, kind: str, **content: Any) -> None:
+        raise NotImplementedError
+
+    def begin(self, guard: Guard) -> None:
+        """An episode begins."""
+        self._flush()  # of one that was broken off
+        self._guard, self._learnt = guard, None
+        self._note_settings(guard)
+        self._record("begin")
+
+    def seen(self, observation: Floats, time: float) -> None:
+        """An observation came in, at ``time`` [s]."""
+        if self._guard is None:
+            raise ValueError("the log was given to a guard within an episode; give it before one")
+        self._flush()
+        self._row = {"observation": observation.tolist(), "time": float(time)}
+
+    def decided(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
+        """A decision was made. When this returns it is recorded."""
+        if self._guard is None:
+            return
+        self._note_settings(self._guard)
+        mask = None if proposal.mask is None else proposal.mask.tolist()
+        row, self._row = self._row | {"mask": mask, "proposed": written(proposal.action)}, {}
+        if is_spoken(self._guard.reviser, revision):
+            self._record("decision", **row, **decision_of(situation, revision))
+        else:
+            self._record("quiet", **row)
+
+    def ended(self, observation: Any, **how: Any) -> None:
+        """The episode ended."""
+        if self._guard is None:
+            return
+        self._flush()
+        self._learnt, self._guard = digests_of(self._guard), None
+        last = None if observation is None else observation.tolist()
+        self._record("end", learnt=self._learnt, observation=last, **how)
+
+    def _note_settings(self, guard: Guard) -> None:
+        """Record the settings, if they were changed."""
+        if (now := settings_now(guard)) != self._settings:
+            self._settings = now
+            self._record("settings", settings=now)
+
+    def _flush(self) -> None:
+        """Record what was seen and not decided on."""
+        row, self._row = self._row, {}
+        if row:
+            self._record("seen", **row)
+
+
+class AuditLog(Ledger, Recorder, AbstractContextManager["AuditLog"]):
     """Logs what a guard decides, so that nobody can change it unnoticed: ``Guard(..., audit=log)``.
 
     Where the disk fails while driving, the log is broken off there, which is logged, and raised as
@@ -372,25 +428,20 @@ class AuditLog(Ledger, AbstractContextManager["AuditLog"], DecisionLogger):
     _remedy = "name another file"
 
     def __init__(self, path: Path, *, sync: Literal["record", "episode"] = "record") -> None:
-        super().__init__(path, "name another file")
+        Ledger.__init__(self, path, "name another file")
+        Recorder.__init__(self)
         self.sync = sync
         self._failure: OSError | None = None
-        self._guard: Guard | None = None
         self._who: tuple[Any, ...] = ()  # what the guard of the latest episode was made of
-        self._learnt: dict[str, str] | None = None  # as that episode ended
-        self._settings: dict[str, Any] = {}
-        self._before: list[list[Any]] = []
         self._known: list[str] = []  # what it holds of what a guard is now told again
 
     def close(self) -> None:
         """Write what was held back; an OSError if that failed, now or before."""
-        if self._file.closed:
-            return
+        if not self._is_owner():  # it is closed, or what is held back is the parent's to write
+            return super().close()
         try:
-            if self._is_owner():  # what is held back is the parent's to write
-                self._flush()
-                if self.sync == "episode":
-                    self._try(self.force)
+            self._flush()
+            self._try(self.force)
         finally:
             super().close()
         self._raise()
@@ -402,76 +453,29 @@ class AuditLog(Ledger, AbstractContextManager["AuditLog"], DecisionLogger):
         """Write nothing twice of what followed a record, as a guard is told that once more."""
         records = Chain(self.path).records()
         if after == NOTHING or any(after.digest == record.digest for record in records):
-            for _, _, _, content in records:
-                self._known += [canonical(row[:2]) for row in content.get("before", ())]
-                if content["kind"] == "decision":
-                    self._known.append(canonical([content["time"], content["observation"]]))
-                elif content["kind"] in ("begin", "end"):
-                    self._known.append(content["kind"])
-
-    def _is_known(self, what: str) -> bool:
-        """Whether it is next of what is told again; after what is not, all is new."""
-        is_known = self._known[:1] == [what]
-        self._known = self._known[1:] if is_known else []
-        return is_known
-
-    # -- As a guard's decision logger -------------------------------------------------------------
+            contents = (record.content for record in records)
+            self._known = [_event(content) for content in contents if content["kind"] != "start"]
 
     def begin(self, guard: Guard) -> None:
-        """An episode begins."""
+        """An episode begins; an OSError if something could not be written since the one before."""
+        self._flush()
+        is_replayable = can_be_made_again(guard)
+        parts = guard.reviser, guard.machine, guard.judge, guard.failed, is_replayable
+        if self._learnt != digests_of(guard) or any(map(is_not, parts, self._who)):
+            self._settings = settings_now(guard)
+            self._record("start", settings=self._settings, **_start(guard))
+        self._who = parts
+        super().begin(guard)
         self._raise()
-        self._flush()  # of an episode that was broken off
-        parts = (guard.reviser, guard.machine, guard.judge, guard.failed, _asks_code(guard))
-        if list(map(id, parts)) != list(map(id, self._who)) or self._learnt != digests_of(guard):
-            self._write("start", **_start(guard))
-        self._guard, self._who, self._learnt = guard, parts, None
-        self._settings = settings_now(guard)
-        self._write("begin", settings=self._settings)
-        self._raise()
 
-    def seen(self, observation: Floats, time: float) -> None:
-        """An observation came in, at ``time`` [s]."""
-        if self._guard is None:
-            raise ValueError("the log was given to a guard within an episode; give it before one")
-        self._before.append([float(time), observation.tolist()])
-
-    def decided(self, situation: Situation, proposal: Proposal, revision: Revision) -> None:
-        """A decision was made. When this returns it is written down, if it said something."""
-        if self._guard is None:
-            return
-        time, observation = self._before.pop()
-        if self._known and self._is_known(canonical([time, observation])):
-            return
-        now = settings_now(self._guard)
-        if now != self._settings:
-            self._flush()
-            self._write("settings", settings=now)
-            self._settings = now
-        if is_spoken(self._guard.reviser, revision):
-            decision = decision_of(situation, proposal, revision)
-            self._write("decision", time=time, observation=observation, **decision)
-        else:
-            masks = [] if proposal.mask is None else [proposal.mask.tolist()]
-            self._before.append([time, observation, written(proposal.action), *masks])
-            if len(self._before) >= _MOST_QUIET:
-                self._flush()
-
-    def ended(
-        self, observation: Any, *, failed: bool, terminated: bool, score: float | None
-    ) -> None:
+    def ended(self, observation: Any, **how: Any) -> None:
         """The episode ended; an OSError if something could not be written since it began."""
-        if self._guard is None:
-            return
-        self._learnt = digests_of(self._guard)
-        last = None if observation is None else observation.tolist()
-        how = {"failed": bool(failed), "terminated": terminated, "score": score}
-        self._write("end", learnt=self._learnt, observation=last, **how)
-        self._guard = None
+        super().ended(observation, **how)
         self._raise()
 
     def savepoint(self) -> Rollback:
         """What takes back all that is logged from now on, in the file, too."""
-        attributes = {**self.__dict__, "_before": [*self._before]}
+        attributes = {**self.__dict__}
 
         def rollback() -> None:
             self.__dict__.update(attributes)
@@ -480,18 +484,17 @@ class AuditLog(Ledger, AbstractContextManager["AuditLog"], DecisionLogger):
 
         return rollback
 
-    def _flush(self) -> None:
-        if self._before:
-            self._write("quiet")
-
-    def _write(self, kind: str, **content: Any) -> None:
-        if self._known and (kind == "start" or self._is_known(kind)):
-            return
-        if "before" in FIELDS[kind]:
-            content["before"], self._before = self._before, []
+    def _record(self, kind: str, **content: Any) -> None:
         record = {"kind": kind, "clock": datetime.now(UTC).isoformat(), **content}
+        if self._known:
+            is_next = self._known[0] == _event(record)
+            if is_next or kind == "start":
+                self._known = self._known[is_next:]
+                return
+            self._known = []  # after what is not, all is new
         self._try(lambda: self._append(record))
-        if self.sync == "record" or kind in ("begin", "end"):
+        speaks = kind not in ("seen", "quiet") or self.head.number % _MOST_QUIET == 0
+        if kind in ("begin", "end") or (self.sync == "record" and speaks):
             self._try(self.force)
 
     def _try(self, write: Callable[[], None]) -> None:
@@ -500,18 +503,19 @@ class AuditLog(Ledger, AbstractContextManager["AuditLog"], DecisionLogger):
             try:
                 write()
             except OSError as error:
-                self._failure = error
-                record = self.head.number
-                _log.error("the audit log %s ends with record %s: %s", self.path, record, error)
+                why = f"{error.strerror}; the audit log ends with record {self.head.number}"
+                advice = "go on with another one, or with none (guard.audit = None)"
+                self._failure = OSError(error.errno, f"{why}: {advice}", str(self.path))
+                _log.error("%s", self._failure)
 
     def _raise(self) -> None:
         if self._failure is not None:
-            raise OSError(
-                self._failure.errno,
-                f"{self._failure.strerror}; the audit log ends with record {self.head.number}: go "
-                "on with another one, or with none (guard.audit = None)",
-                str(self.path),
-            ) from self._failure
+            raise self._failure
+
+
+def _event(content: Mapping[str, Any]) -> str:
+    """What a guard was told, whatever came of it."""
+    return canonical([content["kind"], content.get("time"), content.get("observation")])
 
 
 # -- What is written ------------------------------------------------------------------------------
@@ -528,15 +532,9 @@ def made_by() -> dict[str, str]:
     }
 
 
-def _asks_code(guard: Guard) -> bool:
-    """Whether what it learns hangs on a model or a backup that it was given: no log holds code."""
-    functions = (getattr(guard.judge, "__dict__", {}).get(name) for name in ("model", "backup"))
-    return guard.learn and any(map(callable, functions))
-
-
 def _start(guard: Guard) -> dict[str, Any]:
     file = BytesIO()
-    if is_replayable := can_be_made_again(guard) and not _asks_code(guard):
+    if is_replayable := can_be_made_again(guard):
         guard.save(file)
         if not (is_replayable := file.tell() < _LONGEST_LINE // 2):
             _log.warning("the guard is too large for an audit log: it will not be replayed")
@@ -566,22 +564,18 @@ def digests_of(guard: Guard) -> dict[str, str]:
     return digests
 
 
-def decision_of(situation: Situation, proposal: Proposal, revision: Revision) -> dict[str, Any]:
-    """A decision, as it is written, but for what came in."""
+def decision_of(situation: Situation, revision: Revision) -> dict[str, Any]:
+    """What was decided, but for what came in."""
     likely = np.argsort(-situation.belief, kind="stable")[:_STATES].tolist()
-    decision = Decision(situation, revision._replace(proposed=proposal.action))
+    decision = Decision(situation, revision)
     return {
-        **{name: _plain(RECORD[name].kind, RECORD[name].read(decision)) for name in _TOLD},
+        **{name: _plain(RECORD[name].kind, RECORD[name].read(decision)) for name in _DECIDED},
         "belief": [[state, float(situation.belief[state])] for state in likely],
-        "interval": [float(bound) for bound in revision.interval],
-        "mask": None if proposal.mask is None else proposal.mask.tolist(),
     }
 
 
 def _plain(kind: type, value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return written(value)
-    return None if value is None else kind(value)
+    return None if value is None else written(value) if kind is float else kind(value)
 
 
 # -- Auditing -------------------------------------------------------------------------------------
@@ -592,10 +586,12 @@ _NO_FUNCTION = (
     "the guard was given a function that says where it fails, and no log holds code; give it as "
     "failed (--failed MODULE:FUNCTION)"
 )
-# Where there is a decision logger, decisions that speak are explained.
-_DEAF: Any = SimpleNamespace(
-    **dict.fromkeys(("begin", "seen", "decided", "ended"), lambda *told, **rest: None)
-)
+# What is said of a record that comes out otherwise.
+_OTHERWISE = {
+    **dict.fromkeys(("start", "settings"), "there are no such settings"),
+    **dict.fromkeys(("quiet", "decision"), "the decision at {time:g} s comes out otherwise"),
+    "end": "something else was learnt until its end",
+}
 _Failed = Callable[[Floats], bool]
 
 
@@ -670,20 +666,19 @@ fields=())
         fault = _misfit(record, started=counts["start"] > 0)
         if fault is not None:
             break
-        kind, before = record.content["kind"], record.content.get("before", ())
-        counts[kind] += 1
-        counts["all decisions"] += len(before) + (kind == "decision")
-        if difference is None:
-            difference = player.play(record)
+        kind = record.content["kind"]
+        counts.update([kind, "decided"] if kind in ("quiet", "decision") else [kind])
+        difference = difference or player.play(record)
     fault = fault or chain.finding
     if chain.head == NOTHING and fault is None:
         raise ValueError(f"{path} is no audit log, or no record of it was finished")
-    names = "start", "begin", "all decisions", "decision", "settings"
     return Audit(
         head=chain.head,
         half_written=chain.half_written,
         finding=fault,
-        contents=Contents(*(counts[name] for name in names)),
+        contents=Contents(
+            *(counts[kind] for kind in ("start", "begin", "decided", "decision", "settings"))
+        ),
         replayed=player.decisions,
         difference=difference,
         not_replayed=tuple(player.not_replayed),
@@ -698,68 +693,59 @@ def _misfit(record: Record, *, started: bool) -> Finding | None:
     why = ""
     if not isinstance(kind, str) or kind not in FIELDS:
         why = f"there is no kind {str(kind)[:40]!r}"
-    elif type(version) is not int or version != LOG_VERSION:
+    elif repr(version) != repr(LOG_VERSION):
         why = f"its version is {version!r}, not {LOG_VERSION} (did a newer evofsm write it?)"
     elif kind != "start" and not started:
         why = "it comes before the guard that decides"
     elif names := sorted((FIELDS[kind] | {"kind", "clock"}) ^ content.keys()):
         has = "has" if names[0] in content else "lacks"
         why = f"a record of kind {kind!r} {has} {names[0][:40]!r}"
-    elif not isinstance(content.get("before", []), list):
-        why = "what it holds before it is no list"
     return Finding(record.number, f"record {record.number} was forged: {why}") if why else None
 
 
-class _DiffersError(Exception):
-    """Something came out otherwise: an explanation, and the fields."""
-
-
-class _Player:
-    """The guard that a log began with, told again what happened."""
+class _Player(Recorder):
+    """The guard that a log began with, told again what happened; and what it records of that."""
 
     def __init__(self, failed: _Failed | None) -> None:
-        self.decisions = 0
+        super().__init__()
+        self.decisions = 0  #: that came out as they were recorded
         self.not_replayed: list[str] = []
         self.other_makers: dict[str, Field] = {}
         self._failed = failed
-        self._guard: Guard | None = None  # None while a session cannot be replayed
+        self._told: Guard | None = None  # None while a session cannot be replayed
+        self._outputs: list[dict[str, Any]] = []  # what it recorded of the latest record
+
+    def _record(self, kind: str, **content: Any) -> None:
+        self._outputs.append({"kind": kind, **content})
 
     def play(self, record: Record) -> Finding | None:
         """What differs; None where it comes out as it was recorded."""
+        content, kind, self._outputs = record.content, record.content["kind"], []
         try:
-            self._play(record.content)
-        except _DiffersError as differs:
-            return Finding(record.number, *differs.args)
+            if kind == "start":
+                self._start(content)
+            elif self._told is not None:
+                self._tell(self._told, content)
+            if self._told is None:
+                return None
+            if len(self._outputs) != 1:
+                raise ValueError("it does not follow from what came before")
+            fields = self._differing(content, self._outputs[0])
         except _NONSENSE as error:
             text = f"there is no {error}" if isinstance(error, KeyError) else str(error)
             return Finding(record.number, f"it cannot be replayed: {text}")
+        if fields:
+            why = _OTHERWISE.get(kind, "what came in at {time} s comes out otherwise")
+            return Finding(record.number, why.format(**content), fields)
+        self.decisions += kind in ("quiet", "decision")
         return None
-
-    def _play(self, content: Mapping[str, Any]) -> None:
-        kind, before, guard = content["kind"], content.get("before", ()), self._guard
-        if kind == "start":
-            self._start(content)
-        elif guard is not None:
-            if not guard._under_way and (before or kind in ("decision", "end")):
-                raise ValueError("it belongs to no episode")
-            for row in before:
-                self._row(guard, None, row)
-            if kind in ("begin", "settings"):
-                self._set(guard, content["settings"])
-            if kind == "begin":
-                guard.begin()
-            elif kind == "decision":
-                names = ("time", "observation", "proposed", "mask")
-                self._row(guard, content, [content[name] for name in names])
-            elif kind == "end":
-                self._end(guard, content)
 
     def _start(self, content: Mapping[str, Any]) -> None:
         now = made_by()
         for name, then in content["made_by"].items():
             if then != now.get(name):
                 self.other_makers[name] = Field(name, str(then), now.get(name, ""))
-        self._guard, needs_code = None, content["told_failures"]
+        self._told, needs_code = None, content["told_failures"]
         if content["guard"] is None:
             self.not_replayed.append(
                 f"{content['reviser']} or its judge is not known here, or was not told what "
@@ -769,66 +755,54 @@ class _Player:
             self.not_replayed.append(_NO_FUNCTION)
         else:
             file = BytesIO(base64.b64decode(content["guard"], validate=True))
-            self._guard = Guard.load(file, failed=self._failed if needs_code else None)
-            self._guard.audit = _DEAF
+            self._told = Guard.load(file, failed=self._failed if needs_code else None)
+            self._told.audit = self
+            self._settings = settings_now(self._told)
+            self._record(**{**content, "settings": self._settings})
 
-    @staticmethod
-    def _set(guard: Guard, settings: Mapping[str, Any]) -> None:
-        for name in SETTINGS:
-            if getattr(guard, name) != settings[name]:
-                setattr(guard, name, settings[name])
-        set_again(guard.reviser, settings["reviser"])
-        if fields := _differing(settings, settings_now(guard)):
-            raise _DiffersError("there are no such settings", fields)
+    def _tell(self, guard: Guard, content: Mapping[str, Any]) -> None:
+        kind = content["kind"]
+        if kind == "begin":
+            guard.begin()
+        elif kind == "settings":
+            settings = content["settings"]
+            for name in SETTINGS:
+                if getattr(guard, name) != settings[name]:
+                    setattr(guard, name, settings[name])
+            set_again(guard.reviser, settings["reviser"])
+            self._note_settings(guard)
+        elif kind == "end":
+            last = content["observation"]
+            how = {name: content[name] for name in ("failed", "terminated", "score")}
+            guard.end(observation=None if last is None else _numbers(last), **how)
+        else:
+            observation, time = _numbers(content["observation"]), _numbers(content["time"])
+            situation = guard.recognise(observation, time)
+            if kind == "seen":
+                self._flush()
+            else:
+                mask = checked_mask(guard.actions, content["mask"])
+                guard.revise(situation, Proposal(_numbers(content["proposed"]), mask))
 
-    def _row(self, guard: Guard, content: Mapping[str, Any] | None, row: Sequence[Any]) -> None:
-        """A row that was decided on so, or of which nothing was to be said; or not decided on."""
-        time, observation, *proposed = row
-        situation = guard.recognise(_floats(observation), _number(time))
-        if not proposed:
-            return
-        action, mask = proposed if len(proposed) > 1 else (*proposed, None)
-        action = _floats(action) if isinstance(action, list) else _number(action)
-        proposal = Proposal(action, checked_mask(guard.actions, mask))
-        revision = guard.revise(situation, proposal)
-        entry = decision_of(situation, proposal, revision)
-        when, speaks = f"the decision at {situation.time:g} s", is_spoken(guard.reviser, revision)
-        if content is None and speaks:
-            raise _DiffersError(
-                f"{when} was recorded as nothing to speak of, but {entry['reason']}",
-                (Field("executed", canonical(entry["proposed"]), canonical(entry["executed"])),),
-            )
-        if content and (fields := _differing({name: content[name] for name in entry}, entry)):
-            raise _DiffersError(f"{when} comes out otherwise", fields)
-        if content and not speaks:
-            raise _DiffersError(f"{when} changed nothing")
-        self.decisions += 1
-
-    def _end(self, guard: Guard, content: Mapping[str, Any]) -> None:
-        last = content["observation"]
-        how = {name: content[name] for name in ("failed", "terminated", "score")}
-        guard.end(observation=None if last is None else _floats(last), **how)
-        fields = _differing(content["learnt"], digests_of(guard))
-        if fields and "evofsm" not in self.other_makers:  # whose version stands in what is saved
-            raise _DiffersError("something else was learnt until its end", fields)
+    def _differing(self, *contents: Mapping[str, Any]) -> tuple[Field, ...]:
+        """What a log and this say otherwise, of all that both do."""
+        before, after = (
+            {"executed": content.get("proposed"), **content, **content.get("settings", {})}
+            for content in contents
+        )
+        if "evofsm" not in self.other_makers:  # whose version stands in what is saved
+            before, after = before | before.get("learnt", {}), after | after.get("learnt", {})
+        names = sorted((before.keys() & after.keys()) - {"clock", "learnt", "settings"})
+        fields = [Field(name, canonical(before[name]), canonical(after[name])) for name in names]
+        return tuple(field for field in fields if field.recorded != field.replayed)
 
 
-def _number(value: Any) -> float:
+def _numbers(value: Any) -> Any:
+    """A number, or an array of a list of them, from what JSON holds of them."""
+    if isinstance(value, list):
+        return np.array([_numbers(number) for number in value])
     if value in ("NaN", "Infinity", "-Infinity"):
         return float(value)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ValueError(f"{value!r} stands where a number should")
     return float(value)
-
-
-def _floats(values: Sequence[Any]) -> Floats:
-    return np.array([_number(value) for value in values])
-
-
-def _differing(recorded: Mapping[str, Any], again: Mapping[str, Any]) -> tuple[Field, ...]:
-    before, after = (
-        {name: canonical(value) for name, value in of.items()} for of in (recorded, again)
-    )
-    names = sorted(before.keys() | after.keys())
-    fields = [Field(name, before.get(name, ""), after.get(name, "")) for name in names]
-    return tuple(field for field in fields if field.recorded != field.replayed)

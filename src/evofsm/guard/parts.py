@@ -60,11 +60,13 @@ def outline(guard: _Guard) -> dict[str, Any]:
 
 
 def can_be_made_again(guard: _Guard) -> bool:
-    """Whether `rebuild` needs no more than the `outline`."""
-    parts = outline(guard)
-    knows_judge = guard.judge is None or parts["judge"] is not None
-    reviser: Any = parts["reviser"]
-    return knows_judge and reviser is not None and reviser.get("asks_judge", True)
+    """Whether `rebuild` needs no more than the `outline`, and learning no code that was given."""
+    parts, judge = outline(guard), guard.judge
+    functions = (getattr(judge, "__dict__", {}).get(name) for name in ("model", "backup"))
+    asks_code = guard.learn and any(map(callable, functions))
+    knows_judge = judge is None or parts["judge"] is not None
+    reviser: Any = parts["reviser"] or {"asks_judge": False}
+    return knows_judge and not asks_code and bool(reviser.get("asks_judge", True))
 
 
 def rebuild(

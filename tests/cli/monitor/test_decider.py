@@ -248,6 +248,7 @@ def test_where_the_audit_log_cannot_be_written_the_decisions_go_on(tmp_path, mon
         for message in [line(row), b'{"end": true}'][: 2 if k % 10 == 9 else 1]:
             assert decider.answer(message) == plain.answer(message)
     assert guard.audit is None
+    monkeypatch.undo()
     log.close()
     assert audit(log.path).is_good  # as far as it goes
 
