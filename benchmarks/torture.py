@@ -517,6 +517,7 @@ def _packed(header: dict[str, Any], numbers: bytes) -> bytes:
     told = json.dumps(header["__metadata__"]["evofsm"])
     header = header | {"__metadata__": {"sha256": "0" * 64, "evofsm": told}}
     unsigned = json.dumps(header).encode()
+    unsigned += b" " * (-len(unsigned) % 8)
     digest = hashlib.sha256(unsigned + numbers).hexdigest().encode()
     return len(unsigned).to_bytes(8, "little") + unsigned.replace(b"0" * 64, digest, 1) + numbers
 

@@ -139,6 +139,7 @@ def forge():
                 one["data_offsets"] = [place, place := place + end - begin]
         metadata = {"sha256": "0" * 64, "evofsm": json.dumps(told)}
         header = json.dumps({"__metadata__": metadata, **entries}).encode()
+        header += b" " * (-len(header) % 8)
         digest = hashlib.sha256(header + numbers).hexdigest().encode()
         signed = header.replace(b"0" * 64, digest, 1)
         path.write_bytes(len(header).to_bytes(8, "little") + signed + numbers)

@@ -7,8 +7,8 @@ place of each array; then the numbers of all arrays, row by row. Under ``__metad
 header, with 64 zeros in its place, and all numbers.
 
 What a kind of file may hold is declared once, as a `Kind`, where it belongs. A file is held against
-it before anything is allocated: a checksum shows damage, but whoever forges a file can take it
-anew, and kernels take sizes and indices on trust.
+it, and takes no more memory than it has bytes: a checksum shows damage, but whoever forges a file
+can take it anew, and kernels take sizes and indices on trust.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import secrets
 import shutil
 import stat
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
@@ -82,11 +82,19 @@ class Numbers(NamedTuple):
     def refuse_others(
         self, name: str, given: Any, sizes: dict[int | str, int] | None = None
     ) -> None:
-        """Raise a ValueError for another shape, or a number that is not in the range (as NaN)."""
-        numbers = np.asarray(given)
+        """Raise a ValueError for another shape, or a number that is not in the range (as NaN).
+
+        A shape has to agree with the ``sizes`` so far, to which it adds its own.
+        """
+        numbers, sizes = np.asarray(given), {} if sizes is None else sizes
         if numbers.dtype.kind not in "iufb" or isinstance(given, bool):
             raise ValueError(f"{name} is {given!r}; it must be a number")
-        self.refuse_shape(name, numbers.shape, {} if sizes is None else sizes)
+        fits = numbers.ndim == len(self.shape)
+        for size, have in zip(self.shape, numbers.shape, strict=False):
+            fits &= have == (size if isinstance(size, int) else sizes.setdefault(size, have))
+        if not fits:
+            right_shape = tuple(sizes.get(size, size) for size in self.shape)
+            raise ValueError(f"{name} has shape {numbers.shape}, not {right_shape}, as others say")
         if not numbers.size or numbers.dtype.kind == "b":
             return
         for number in (float(numbers.min()), float(numbers.max())):
@@ -97,15 +105,6 @@ class Numbers(NamedTuple):
                 )
         if self.whole and (isinstance(given, float) or (numbers != np.rint(numbers)).any()):
             raise ValueError(f"{name} holds a fraction; it must be an integer")
-
-    def refuse_shape(self, name: str, shape: tuple[int, ...], sizes: dict[int | str, int]) -> None:
-        """Raise unless a shape agrees with the ``sizes`` so far, to which it adds its own."""
-        fits = len(shape) == len(self.shape)
-        for size, have in zip(self.shape, shape, strict=False):
-            fits &= have == (size if isinstance(size, int) else sizes.setdefault(size, have))
-        if not fits:
-            right_shape = tuple(sizes.get(size, size) for size in self.shape)
-            raise ValueError(f"{name} has shape {shape}, not {right_shape}, as others say")
 
 
 COUNT = Numbers(least=0.0, most=MOST_COUNTED, whole=True)
@@ -159,31 +158,38 @@ def write(
     if not isinstance(provenance, Mapping | None):
         raise TypeError(f"provenance is {provenance!r}; it must be a mapping of names to values")
     header = Header(kind.name, _VERSION, __version__, dict(settings), dict(provenance or {}))
-    parts = _packed(kind, header, arrays)
-    with replacing(place) if isinstance(place, str | os.PathLike) else nullcontext(place) as file:
-        file.writelines(parts)
-
-
-def _packed(kind: Kind, header: Header, arrays: Mapping[str, NDArray[Any]]) -> list[Any]:
-    """The bytes of a file, one part after the other, if it may hold all of this."""
-    entries: dict[str, _Entry] = {}
-    begin = 0
-    for name, array in arrays.items():
-        dtype, end = _TYPE_NAMES.get(array.dtype, str(array.dtype)), begin + array.nbytes
-        entries[name] = _Entry(dtype, list(array.shape), [begin, end])
-        begin = end
-    text = json.dumps(header._asdict())
-    sizes = _refuse_unfit(kind, json.loads(text)["settings"], entries)
-    for name, numbers in kind.arrays.items():
-        numbers.refuse_others(name, arrays[name], sizes)
-    index: dict[str, Any] = {name: entry._asdict() for name, entry in entries.items()}
-    head = json.dumps({"__metadata__": {"sha256": _UNSIGNED, "evofsm": text}, **index}).encode()
-    head += b" " * (-len(head) % 8)  # so that numbers begin at a multiple of eight
-    if len(head) > _LARGEST_HEADER or begin > _LARGEST_FILE:
+    header = Header(*json.loads(json.dumps(header)))  # as it is read
+    _refuse_unfit(kind, header.settings, arrays)
+    head = _head(header, arrays)
+    numbers = b"".join(array.tobytes() for array in arrays.values())
+    if len(head) > _LARGEST_HEADER or len(numbers) > _LARGEST_FILE:
         raise ValueError(f"{kind.name} is too large for a file: more than {_LARGEST_FILE:,} bytes")
-    content = [np.ascontiguousarray(array).data for array in arrays.values()]
-    signed_head = head.replace(_UNSIGNED.encode(), _sha256(head, content).encode(), 1)
-    return [len(signed_head).to_bytes(8, "little"), signed_head, *content]
+    data = len(head).to_bytes(8, "little") + _signed(head, _sha256(head, numbers)) + numbers
+    with replacing(place) if isinstance(place, str | os.PathLike) else nullcontext(place) as file:
+        file.write(data)
+
+
+def _head(header: Header, arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    """What stands before the numbers, but for the checksum; a KeyError for another type."""
+    metadata = {"sha256": _UNSIGNED, "evofsm": json.dumps(header._asdict())}
+    index: dict[str, Any] = {"__metadata__": metadata}
+    end = 0
+    for name, array in arrays.items():
+        begin, end = end, end + array.nbytes
+        place = {"shape": array.shape, "data_offsets": [begin, end]}
+        index[name] = {"dtype": _TYPE_NAMES[array.dtype], **place}
+    head = json.dumps(index).encode()
+    return head + b" " * (-len(head) % 8)  # so that numbers begin at a multiple of eight
+
+
+def _signed(head: bytes, sha256: str) -> bytes:
+    return head.replace(_UNSIGNED.encode(), sha256.encode(), 1)
+
+
+def _sha256(head: bytes, numbers: bytes) -> str:
+    digest = hashlib.sha256(head)
+    digest.update(numbers)
+    return digest.hexdigest()
 
 
 @contextmanager
@@ -197,13 +203,12 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     No file can take the place of one that is mounted on its own, or whose folder may not be
     written: what is whole is then written over it, and a warning says so.
     """
-    temporary = None
+    target, mode = _place_of(path)
+    beside = mode is None or os.access(target.parent, os.W_OK)
+    folder = target.parent if beside else Path(gettempdir())
+    temporary = folder / f".{target.name}.{secrets.token_hex(8)}.part"
+    opener = partial(os.open, mode=0o666 if mode is None else 0o600)
     try:
-        target, mode = _place_of(path)
-        beside = mode is None or os.access(target.parent, os.W_OK)
-        folder = target.parent if beside else Path(gettempdir())
-        temporary = folder / f".{target.name}.{secrets.token_hex(8)}.part"
-        opener = partial(os.open, mode=0o666 if mode is None else 0o600)
         with open(temporary, "x+b", opener=opener) as file:
             yield file
             file.flush()
@@ -228,7 +233,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     except BaseException as error:
         if isinstance(error, OSError) and error.errno is not None:
             error.filename, error.filename2 = os.fspath(path), None
-        if temporary is not None and not hasattr(error, "__notes__"):
+        if not hasattr(error, "__notes__"):
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
         raise
@@ -317,29 +322,33 @@ def read(place: Place, kind: Kind) -> tuple[dict[str, Any], dict[str, NDArray[An
     """Read a file of a kind: its settings and its arrays, all that the kind declares checked."""
     with _opened(place) as file:
         with explained(place):
-            header, entries, head, sha256 = _unpacked(file)
+            header, sha256, head, index = _unpacked(file)
         if header.kind != kind.name:
             raise ValueError(f"{_named(place)} holds a {header.kind}, not a {kind.name}")
         with explained(place):
-            sizes = _refuse_unfit(kind, header.settings, entries)
-            arrays = {name: _read_array(file, entry) for name, entry in entries.items()}
-            unsigned_head = head.replace(sha256.encode(), _UNSIGNED.encode(), 1)
-            if _sha256(unsigned_head, [array.data for array in arrays.values()]) != sha256:
+            numbers = file.read()
+            if _sha256(head.replace(sha256.encode(), _UNSIGNED.encode(), 1), numbers) != sha256:
                 raise ValueError("its SHA-256 is another one: it was changed or damaged")
-            for name, numbers in kind.arrays.items():
-                numbers.refuse_others(name, arrays[name], sizes)
+            try:
+                arrays = {name: _array(numbers, entry) for name, entry in index.items()}
+                is_ours = _signed(_head(header, arrays), sha256) == head
+            except _DAMAGE:
+                is_ours = False
+            # Of the ways to write it, only one is `write`'s; the numbers fill it.
+            if not is_ours or sum(array.nbytes for array in arrays.values()) != len(numbers):
+                raise ValueError("its header is none that evofsm writes")
+            _refuse_unfit(kind, header.settings, arrays)
     return header.settings, arrays
 
 
-class _Entry(NamedTuple):
-    """An array in a file, by the names that safetensors gives."""
-
-    dtype: str
-    shape: list[int]
-    data_offsets: list[int]  #: behind the header [bytes]
+def _array(numbers: bytes, entry: Mapping[str, Any]) -> NDArray[Any]:
+    """An array that stands where it says it does; copied, as the numbers cannot be changed."""
+    part = numbers[slice(*entry["data_offsets"])]
+    return np.frombuffer(part, _TYPES[entry["dtype"]]).reshape(entry["shape"]).copy()
 
 
-def _unpacked(file: BinaryIO) -> tuple[Header, dict[str, _Entry], bytes, str]:
+def _unpacked(file: BinaryIO) -> tuple[Header, str, bytes, dict[str, Any]]:
+    """What a file says of itself, its checksum, all of its header, and what it says of arrays."""
     size = file.seek(0, os.SEEK_END)
     if size > _LARGEST_FILE + _LARGEST_HEADER:
         raise ValueError(f"it has {size:,} bytes; no file holds more than {_LARGEST_FILE:,}")
@@ -353,7 +362,6 @@ def _unpacked(file: BinaryIO) -> tuple[Header, dict[str, _Entry], bytes, str]:
         metadata = index.pop("__metadata__")
         header_fields, sha256 = json.loads(metadata["evofsm"]), str(metadata["sha256"])
         version = header_fields["version"]
-        entries, begin = {name: _Entry(**fields) for name, fields in index.items()}, 0
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
         raise ValueError("it is another program's file, or its header is damaged") from None
     if type(version) is int and version > _VERSION:
@@ -363,63 +371,28 @@ def _unpacked(file: BinaryIO) -> tuple[Header, dict[str, _Entry], bytes, str]:
     has_all = {name: type(value) for name, value in header_fields.items()} == types
     if not has_all or not re.fullmatch("[a-z]{1,20}", header_fields["kind"]):
         raise ValueError("its header does not say what it holds")
-    header = Header(**header_fields)
-    for name, entry in entries.items():
-        begin = _end_of(name, entry, begin)
-    if begin != size - 8 - length:
-        raise ValueError(f"its arrays claim {begin:,} bytes, but it has {size - 8 - length:,}")
-    return header, entries, head, sha256
-
-
-def _end_of(name: str, entry: _Entry, begin: int) -> int:
-    """Where an array ends that begins where the one before it ended, if it is as it claims."""
-    lengths = [*entry.shape, *entry.data_offsets]
-    if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or entry.dtype not in _TYPES:
-        raise ValueError(f"{name[:60]!r} of {entry.dtype} is no array that a file may hold")
-    if any(type(length) is not int or length < 0 for length in lengths):
-        raise ValueError(f"{name} claims to be of shape {entry.shape}")
-    end = begin + math.prod(entry.shape) * np.dtype(_TYPES[entry.dtype]).itemsize
-    if entry.data_offsets != [begin, end]:
-        raise ValueError(f"{name} does not stand where it should")
-    return end
-
-
-def _read_array(file: BinaryIO, entry: _Entry) -> NDArray[Any]:
-    array: NDArray[Any] = np.empty(entry.shape, _TYPES[entry.dtype])
-    numbers: Any = array.reshape(-1).view(np.uint8)
-    if file.readinto(numbers.data) != array.nbytes:  # type: ignore[attr-defined]
-        raise EOFError("it ends early")
-    if array.dtype == np.bool_ and (numbers > 1).any():
-        raise ValueError("a boolean is neither true nor false")
-    return array
-
-
-def _sha256(header: bytes, numbers: Iterable[Any]) -> str:
-    digest = hashlib.sha256(header)
-    for array in numbers:
-        digest.update(array)
-    return digest.hexdigest()
+    return Header(**header_fields), sha256, head, index
 
 
 # -- What must agree ------------------------------------------------------------------------------
 
 
 def _refuse_unfit(
-    kind: Kind, settings: Mapping[str, Any], entries: Mapping[str, _Entry]
-) -> dict[int | str, int]:
-    """Raise for what does not fit; returns the number that each name in a shape stands for."""
+    kind: Kind, settings: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
+) -> None:
     sizes: dict[int | str, int] = {}
     _refuse_settings(settings, kind.settings, sizes)
-    if omissions := set(kind.arrays) - set(entries):
-        raise ValueError(f"it lacks {', '.join(sorted(omissions))}")
-    if unknown := set(entries) - set(kind.arrays):
+    if unknown := arrays.keys() - kind.arrays:
         raise ValueError(f"it has {', '.join(sorted(unknown))}, which no {kind.name} has")
+    if omissions := kind.arrays.keys() - arrays:
+        raise ValueError(f"it lacks {', '.join(sorted(omissions))}")
     for name, numbers in kind.arrays.items():
-        dtype = _TYPE_NAMES[np.dtype(numbers.dtype)]
-        if entries[name].dtype != dtype:
-            raise ValueError(f"{name} is of type {entries[name].dtype}, not {dtype}")
-        numbers.refuse_shape(name, tuple(entries[name].shape), sizes)
-    return sizes
+        if (dtype := arrays[name].dtype) != (right := np.dtype(numbers.dtype)):
+            names = _TYPE_NAMES.get(dtype, dtype), _TYPE_NAMES[right]
+            raise ValueError("{} is of type {}, not {}".format(name, *names))
+        if right == np.bool_ and (arrays[name].view(np.uint8) > 1).any():
+            raise ValueError(f"{name} is neither true nor false somewhere")
+        numbers.refuse_others(name, arrays[name], sizes)
 
 
 def _refuse_settings(

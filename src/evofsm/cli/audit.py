@@ -68,7 +68,7 @@ def _facts(found: Audit) -> Iterator[tuple[str, str]]:
     text += f" ({contents.spoke:,} changed something or warned)"
     if contents.settings:
         text += f", {counted(contents.settings, 'setting change')}"
-    yield "holds", text + ("" if breach is None else ", so far")
+    yield "holds", text if breach is None else f"{text}, so far"
     difference, n_matches = found.difference, found.replayed
     text = f"{counted(n_matches, 'decision')} as recorded, to the last bit"
     if difference is None:

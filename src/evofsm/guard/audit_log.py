@@ -53,7 +53,6 @@ SETTINGS = ("explaining", "interval", "learn", "shadow")
 # Most probable states of a belief that are written; records of which one is forced onto the disk,
 # though nothing was to be said; and bytes of a line, which holds a machine at most.
 _STATES, _MOST_QUIET, _LONGEST_LINE = 3, 240, 1 << 26
-_SEAL, _LINE_END = b',"hash":"', b'"}\n'
 _SEEN, _PROPOSED = {"observation", "time"}, {"observation", "time", "mask", "proposed"}
 # What is decided, as it is recorded elsewhere, too.
 _DECIDED = RECORD.keys() - _PROPOSED
@@ -128,27 +127,20 @@ class Record(NamedTuple):
 def seal(content: Mapping[str, Any], after: Head) -> tuple[bytes, Head]:
     """The line of the record that follows ``after``, and the head that it makes."""
     number = after.number + 1
-    text = canonical({**content, "number": number, "previous": after.digest}).encode()[:-1]
-    digest = sha256(text).hexdigest()
-    return text + _SEAL + digest.encode() + _LINE_END, Head(number, digest)
+    text = canonical({**content, "number": number, "previous": after.digest})[:-1]
+    digest = sha256(text.encode()).hexdigest()
+    return f'{text},"hash":"{digest}"}}\n'.encode(), Head(number, digest)
 
 
 def unseal(line: bytes) -> Record | None:
     """The record that a line holds; None where it is not as `seal` writes it."""
-    text, _, end = line.rpartition(_SEAL)
-    digest = sha256(text).hexdigest()
-    if end != digest.encode() + _LINE_END:
-        return None
     try:
-        content = json.loads(text + b"}")
-        # Of the ways to write it, names given twice among them, only one is `seal`'s.
-        if canonical(content).encode()[:-1] != text:
-            return None
-        number, previous = content.pop("number"), content.pop("previous")
+        content = json.loads(line)
+        digest, number, previous = (content.pop(name) for name in ("hash", "number", "previous"))
+        is_whole = type(number) is int and seal(content, Head(number - 1, previous))[0] == line
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
-    whole = type(number) is int and isinstance(previous, str)
-    return Record(number, previous, digest, content) if whole else None
+    return Record(number, previous, digest, content) if is_whole else None
 
 
 class Field(NamedTuple):
