@@ -320,24 +320,22 @@ def read_header(place: Place) -> Header:
 
 def read(place: Place, kind: Kind) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Read a file of a kind: its settings and its arrays, all that the kind declares checked."""
-    with _opened(place) as file:
-        with explained(place):
-            header, sha256, head, index = _unpacked(file)
+    with _opened(place) as file, explained(place):
+        header, sha256, head, index = _unpacked(file)
         if header.kind != kind.name:
-            raise ValueError(f"{_named(place)} holds a {header.kind}, not a {kind.name}")
-        with explained(place):
-            numbers = file.read()
-            if _sha256(head.replace(sha256.encode(), _UNSIGNED.encode(), 1), numbers) != sha256:
-                raise ValueError("its SHA-256 is another one: it was changed or damaged")
-            try:
-                arrays = {name: _array(numbers, entry) for name, entry in index.items()}
-                is_ours = _signed(_head(header, arrays), sha256) == head
-            except _DAMAGE:
-                is_ours = False
-            # Of the ways to write it, only one is `write`'s; the numbers fill it.
-            if not is_ours or sum(array.nbytes for array in arrays.values()) != len(numbers):
-                raise ValueError("its header is none that evofsm writes")
-            _refuse_unfit(kind, header.settings, arrays)
+            raise ValueError(f"it holds a {header.kind}, not a {kind.name}")
+        numbers = file.read()
+        if _sha256(head.replace(sha256.encode(), _UNSIGNED.encode(), 1), numbers) != sha256:
+            raise ValueError("its SHA-256 is another one: it was changed or damaged")
+        try:
+            arrays = {name: _array(numbers, entry) for name, entry in index.items()}
+            is_ours = _signed(_head(header, arrays), sha256) == head
+        except _DAMAGE:
+            is_ours = False
+        # Of the ways to write it, only one is `write`'s; the numbers fill it.
+        if not is_ours or sum(array.nbytes for array in arrays.values()) != len(numbers):
+            raise ValueError("its header is none that evofsm writes")
+        _refuse_unfit(kind, header.settings, arrays)
     return header.settings, arrays
 
 
@@ -435,14 +433,11 @@ def explained(place: Place) -> Iterator[None]:
         yield  # an error may quote what the file has
     except _DAMAGE as error:
         why = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(error)[:300])
-        raise ValueError(f"{_named(place)} cannot be loaded: {why}") from error
+        name = os.fspath(place) if isinstance(place, str | os.PathLike) else "what was given"
+        raise ValueError(f"{name} cannot be loaded: {why}") from error
 
 
 def _opened(place: Place) -> AbstractContextManager[BinaryIO]:
     if isinstance(place, str | os.PathLike):
         return open(place, "rb")
     return nullcontext(place)
-
-
-def _named(place: Place) -> str:
-    return os.fspath(place) if isinstance(place, str | os.PathLike) else "what was given"

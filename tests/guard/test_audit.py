@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 import one_machine
 from evofsm import Guard, IntervalActions
 from evofsm.driving import EnvelopeReviser, LatentRisk, Unrevised, guard_for_cars, measures
-from evofsm.guard import ActionReviser, AuditLog, Head, Mode, audit, audit_log
+from evofsm.guard import ActionReviser, AuditLog, Head, Mode, Proposal, audit, audit_log
 from evofsm.guard.audit_log import FIELDS, NOTHING, Chain, canonical, seal, unseal
 
 ACTIONS = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
@@ -180,6 +180,10 @@ def test_one_writes_at_a_time_and_between_episodes_of_a_guard_only(tmp_path):
         guard.audit = log
         with pytest.raises(ValueError, match="within an episode"):
             guard.decide([50.0, 9.0, 9.0], 0.0)
+        guard.begin()
+        guard.decide([50.0, 9.0, 9.0], 0.0)
+        with pytest.raises(ValueError, match="one decision on an observation"):
+            guard.revise(guard.situation, Proposal(1.0))
 
 
 # -- What is written ------------------------------------------------------------------------------
@@ -287,8 +291,7 @@ def test_sensors_that_fail_come_out_the_same(tmp_path):
         guard.recognise([16.0, 13.0, 7.0], 2.5)  # nothing is decided
         guard.end(failed=False, observation=[14.0, 12.0, 6.0])
     result = audit(path)
-    assert result.is_good
-    assert result.replayed == len(came)
+    assert (result.is_good, result.replayed) == (True, len(came))
 
 
 def test_what_came_in_last_before_an_episode_was_broken_off_is_written_and_replayed(tmp_path):
@@ -366,6 +369,7 @@ REPLAYED = {
     "reason": ("decision", 2, other("reason", "the driver wished it")),
     "explanation": ("decision", 4, other("explanation", "all was well here")),
     "learnt": ("end", 0, lambda content: content["learnt"].update(judge="0" * 64)),
+    "nothing learnt": ("end", 0, other("learnt", {})),
     "a flag that is none": ("end", 0, other("failed", 0)),
     "no number": ("decision", 1, other("observation", ["x", 1.0, 2.0])),
     "no guard": ("start", 0, other("guard", "AAAA")),
@@ -386,14 +390,11 @@ MISFITS = {
 def test_a_forgery_behind_a_chain_that_was_made_anew_is_found_by_replaying(driven, tmp_path, name):
     number = forge(driven, tmp_path / "forged", *REPLAYED[name])
     result = audit(tmp_path / "forged")
-    assert result.finding is None
-    assert not result.is_good
-    assert result.difference.record == number
+    assert (result.finding, result.is_good, result.difference.record) == (None, False, number)
 
 
-@pytest.mark.parametrize("name", MISFITS)
-def test_what_no_log_holds_is_a_forgery(driven, tmp_path, name):
-    kind, change = MISFITS[name]
+@pytest.mark.parametrize(("kind", "change"), MISFITS.values(), ids=MISFITS.keys())
+def test_what_no_log_holds_is_a_forgery(driven, tmp_path, kind, change):
     number = forge(driven, tmp_path / "forged", kind, 0, change)
     result = audit(tmp_path / "forged")
     assert result.finding.record == number
@@ -417,7 +418,7 @@ def test_a_name_given_twice_is_found_behind_its_own_hash(driven, tmp_path):
 
 
 def test_a_decision_that_was_hidden_or_invented_is_found_by_replaying(driven, tmp_path):
-    """As if the proposal had been executed: its row stands among the quiet ones, and vice versa."""
+    """As if the proposal had been executed."""
 
     def hide(lines):
         at = next(k for k, one in enumerate(lines) if one["kind"] == "decision")
@@ -427,8 +428,7 @@ def test_a_decision_that_was_hidden_or_invented_is_found_by_replaying(driven, tm
     anew(driven, tmp_path / "forged", hide)
     difference = audit(tmp_path / "forged").difference
     assert difference.record == kinds(driven).index("decision") + 1
-    executed, kind = difference.fields
-    assert (executed.recorded, kind) == ("2.0", ("kind", '"quiet"', '"decision"'))
+    assert ("kind", '"quiet"', '"decision"') in difference.fields
 
 
 def test_who_made_a_log_otherwise_is_named(driven, tmp_path):

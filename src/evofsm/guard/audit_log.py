@@ -357,6 +357,8 @@ class Recorder(DecisionLogger):
         """A decision was made. When this returns it is recorded."""
         if self._guard is None:
             return
+        if not self._row:
+            raise ValueError("a log holds one decision on an observation; recognise it once more")
         self._note_settings(self._guard)
         mask = None if proposal.mask is None else proposal.mask.tolist()
         row, self._row = self._row | {"mask": mask, "proposed": written(proposal.action)}, {}
@@ -513,27 +515,27 @@ def _event(content: Mapping[str, Any]) -> str:
 # -- What is written ------------------------------------------------------------------------------
 
 
-def made_by() -> dict[str, str]:
-    """What computes: floats are the same to the last bit only where this is."""
-    return {
-        "evofsm": evofsm.__version__,
-        "numba": numba.__version__,
-        "numpy": np.__version__,
-        "processor": platform.machine(),
-        "python": platform.python_version(),
-    }
+#: What computes: floats are the same to the last bit only where this is.
+MADE_BY: Mapping[str, str] = {
+    "evofsm": evofsm.__version__,
+    "numba": numba.__version__,
+    "numpy": np.__version__,
+    "processor": platform.machine(),
+    "python": platform.python_version(),
+}
 
 
 def _start(guard: Guard) -> dict[str, Any]:
     file = BytesIO()
-    if is_replayable := can_be_made_again(guard):
+    if can_be_made_again(guard):
         guard.save(file)
-        if not (is_replayable := file.tell() < _LONGEST_LINE // 2):
-            _log.warning("the guard is too large for an audit log: it will not be replayed")
+    if is_too_large := file.tell() > _LONGEST_LINE // 2:
+        _log.warning("the guard is too large for an audit log: it will not be replayed")
+    data = b"" if is_too_large else file.getvalue()
     return {
         "about": AuditLog._about,
-        "guard": base64.b64encode(file.getvalue()).decode() if is_replayable else None,
-        "made_by": made_by(),
+        "guard": base64.b64encode(data).decode() or None,
+        "made_by": MADE_BY,
         "reviser": type(guard.reviser).__name__,
         "told_failures": guard.failed is not None,
         "version": LOG_VERSION,
@@ -578,12 +580,9 @@ _NO_FUNCTION = (
     "the guard was given a function that says where it fails, and no log holds code; give it as "
     "failed (--failed MODULE:FUNCTION)"
 )
-# What is said of a record that comes out otherwise.
-_OTHERWISE = {
-    **dict.fromkeys(("start", "settings"), "there are no such settings"),
-    **dict.fromkeys(("quiet", "decision"), "the decision at {time:g} s comes out otherwise"),
-    "end": "something else was learnt until its end",
-}
+# What is said of records that come out otherwise, but of decisions.
+_OTHERWISE = dict.fromkeys(("start", "settings"), "there are no such settings")
+_OTHERWISE["end"] = "something else was learnt until its end"
 _Failed = Callable[[Floats], bool]
 
 
@@ -658,19 +657,18 @@ fields=())
         fault = _misfit(record, started=counts["start"] > 0)
         if fault is not None:
             break
-        kind = record.content["kind"]
-        counts.update([kind, "decided"] if kind in ("quiet", "decision") else [kind])
+        counts[record.content["kind"]] += 1
         difference = difference or player.play(record)
     fault = fault or chain.finding
     if chain.head == NOTHING and fault is None:
         raise ValueError(f"{path} is no audit log, or no record of it was finished")
+    kinds = ("start", "begin", "quiet", "decision", "settings")
+    sessions, episodes, quiet, spoke, changes = (counts[kind] for kind in kinds)
     return Audit(
         head=chain.head,
         half_written=chain.half_written,
         finding=fault,
-        contents=Contents(
-            *(counts[kind] for kind in ("start", "begin", "decided", "decision", "settings"))
-        ),
+        contents=Contents(sessions, episodes, quiet + spoke, spoke, changes),
         replayed=player.decisions,
         difference=difference,
         not_replayed=tuple(player.not_replayed),
@@ -727,16 +725,15 @@ class _Player(Recorder):
             text = f"there is no {error}" if isinstance(error, KeyError) else str(error)
             return Finding(record.number, f"it cannot be replayed: {text}")
         if fields:
-            why = _OTHERWISE.get(kind, "what came in at {time} s comes out otherwise")
-            return Finding(record.number, why.format(**content), fields)
+            decision = f"the decision at {content.get('time')} s comes out otherwise"
+            return Finding(record.number, _OTHERWISE.get(kind, decision), fields)
         self.decisions += kind in ("quiet", "decision")
         return None
 
     def _start(self, content: Mapping[str, Any]) -> None:
-        now = made_by()
         for name, then in content["made_by"].items():
-            if then != now.get(name):
-                self.other_makers[name] = Field(name, str(then), now.get(name, ""))
+            if then != (now := MADE_BY.get(name, "")):
+                self.other_makers[name] = Field(name, str(then), now)
         self._told, needs_code = None, content["told_failures"]
         if content["guard"] is None:
             self.not_replayed.append(
@@ -777,16 +774,16 @@ class _Player(Recorder):
                 guard.revise(situation, Proposal(_numbers(content["proposed"]), mask))
 
     def _differing(self, *contents: Mapping[str, Any]) -> tuple[Field, ...]:
-        """What a log and this say otherwise, of all that both do."""
+        """What a log and this say otherwise of one thing."""
         before, after = (
             {"executed": content.get("proposed"), **content, **content.get("settings", {})}
             for content in contents
         )
         if "evofsm" not in self.other_makers:  # whose version stands in what is saved
             before, after = before | before.get("learnt", {}), after | after.get("learnt", {})
-        names = sorted((before.keys() & after.keys()) - {"clock", "learnt", "settings"})
-        fields = [Field(name, canonical(before[name]), canonical(after[name])) for name in names]
-        return tuple(field for field in fields if field.recorded != field.replayed)
+        names = sorted((before.keys() | after.keys()) - {"clock", "learnt", "settings"})
+        texts = [(name, canonical(before.get(name)), canonical(after.get(name))) for name in names]
+        return tuple(Field(name, then, now) for name, then, now in texts if then != now)
 
 
 def _numbers(value: Any) -> Any:

@@ -8,11 +8,10 @@ from __future__ import annotations
 import copy
 import inspect
 import math
-import tempfile
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import FrozenInstanceError, fields, is_dataclass
-from pathlib import Path
+from io import BytesIO
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -254,9 +253,8 @@ def a_file_keeps_it(make: Make) -> None:
     guard, judge = _taught(make)
     if not hasattr(judge, "learn"):
         return
-    with tempfile.TemporaryDirectory() as folder:
-        guard.save(Path(folder) / "guard")
-        again = Guard.load(Path(folder) / "guard", judge=type(judge))
+    guard.save(file := BytesIO())
+    again = Guard.load(file, judge=type(judge))
     equal = _same(_asked(judge), _asked(again.judge))
     _insist(equal, "one that was saved and loaded judges otherwise (is all that it learns saved?)")
 
@@ -289,9 +287,8 @@ def a_machine_takes_it(make: Make) -> None:
     batch.learn_many(Z, np.zeros(len(Z), np.int64))
     _insist(machine.n_states, "a machine with this rule creates no state at all")
     _insist(_same(machine.centers, batch.centers), "learn_many finds other states than observe")
-    with tempfile.TemporaryDirectory() as folder:
-        machine.save(Path(folder) / "machine")
-        again = EvolvingFSM.load(Path(folder) / "machine").rule
+    machine.save(file := BytesIO())
+    again = EvolvingFSM.load(file).rule
     _insist(again == rule, f"from a file it comes back as {again}")
 
 
