@@ -374,11 +374,22 @@ def test_where_a_judge_searches_that_is_what_is_executed():
 def test_what_a_search_finds_outside_is_put_into_the_set():
     class Bold(Searching):
         def search(self, situation, wanted, /, **how):
-            found = super().search(situation, wanted, **how)
-            return found._replace(options=np.array([wanted, [-5.0, 20.0]]), best=1)
+            options = np.array([wanted, [-5.0, 20.0]])
+            return Search(options, self.judge(situation, options), 1, "bold")
 
     guard = searching(judge=Bold())
     assert guard.decide([0.0, 0.0], [0.0, 2.0]).executed.tolist() == [-1.0, 9.0]
+
+
+def test_a_search_keeps_to_what_is_allowed():
+    class Bold(Balance):
+        def search(self, situation, wanted, **_):
+            return Search(np.array([wanted, 2.0]), self.judge(situation, [0, 2]), 1, "bold")
+
+    guard = discrete(judge=Bold(index=True))
+    assert guard.decide([0.0, 0.0], Proposal(0)).executed == 2
+    with pytest.raises(ValueError, match=r"^Bold.search gave .* allowed"):
+        guard.decide([0.0, 0.0], Proposal(0, np.arange(5) != 2))
 
 
 # -- What is refused ----------------------------------------------------------------------------

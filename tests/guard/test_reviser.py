@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 
 from evofsm import IntervalActions
 from evofsm.driving import LatentRisk
-from evofsm.guard import ActionReviser, Judgement, Mode, Proposal, Situation
+from evofsm.guard import ActionReviser, Fallback, Judgement, Mode, Proposal, Situation
 from evofsm.guard.actions import nearest_bounds
+from evofsm.guard.api import Search, Trial
 
 LOW, HIGH, TOLERANCE = -2.5, 2.5, 0.02
 ACTIONS = IntervalActions(low=LOW, high=HIGH, width=0.3)
@@ -48,6 +49,31 @@ def test_who_gives_no_judgement_is_named(risk):
     judge.judge = lambda *_: risk and Judgement(risk, *[[0.0]] * 3, 1.0)
     with pytest.raises(ValueError, match=r"^Told.judge gave .* of 1 actions; .* in \[0, 1\]"):
         ActionReviser(judge, ACTIONS).revise(HERE, Proposal(1.0))
+
+
+FOUND = Search(np.array([1.0, 2.0]), Judgement(*[np.zeros(2)] * 4, 1.0), 1, "found")
+
+
+@pytest.mark.parametrize("mode", [Mode.ACT, Mode.SHADOW])
+@pytest.mark.parametrize(
+    ("name", "answer"),
+    [
+        ("choose", (-1, "the last")),
+        ("fallback", Fallback(math.nan, "what was done")),
+        ("search", None),
+        ("search", FOUND._replace(best=2)),
+        ("search", FOUND._replace(options=np.array([2.0, 1.0]))),
+        ("search", FOUND._replace(options=np.array([1.0, math.nan]))),
+        ("search", FOUND._replace(judged=FOUND.judged._replace(risk=np.full(2, 5.0)))),
+        ("trial", Trial(math.nan, "", "", "", "")),
+    ],
+)
+def test_what_a_judge_names_itself_is_looked_at(mode, name, answer):
+    judge = Told(lambda a: 1.0)
+    setattr(judge, name, answer if name == "fallback" else lambda *_, **how: answer)
+    if (name, mode) != ("trial", Mode.SHADOW):
+        with pytest.raises(ValueError, match=rf"^Told.{name}\b"):
+            ActionReviser(judge, ACTIONS, mode=mode).revise(HERE, Proposal(1.0))
 
 
 @st.composite

@@ -201,11 +201,13 @@ def put_into(actions: ActionSet, action: Action) -> Action:
     return min(max(float(action), actions.low), actions.high)
 
 
-def is_usable(actions: ActionSet, action: Action) -> bool:
-    """Whether an action is finite, and one of a few where there are only those."""
+def is_usable(actions: ActionSet, action: Action, mask: Mask | None = None) -> bool:
+    """Whether an action is finite, and one of those allowed where there are only a few."""
     if isinstance(actions, BoxActions):
         return np.shape(action) == actions.half.shape and all(np.isfinite(action).tolist())
-    return math.isfinite(action) and not (isinstance(actions, Choices) and action not in actions)
+    if not math.isfinite(action) or (isinstance(actions, Choices) and action not in actions):
+        return False
+    return mask is None or bool(mask[int(action)])
 
 
 def checked_mask(actions: ActionSet, mask: ArrayLike | None) -> Mask | None:

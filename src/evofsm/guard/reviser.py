@@ -7,6 +7,7 @@ arXiv:2006.08092).
 from __future__ import annotations
 
 import math
+import operator
 import warnings
 from enum import Enum
 from functools import partial
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.sharing import Rollback
-from evofsm.fsm.validation import action_name, probability
+from evofsm.fsm.validation import action_name, check_index, probability
 from evofsm.guard.actions import (
     Action,
     ActionSet,
@@ -100,7 +101,7 @@ def make_usable(proposal: Proposal, actions: ActionSet, fallback: Fallback = NOT
     Usable(action=0.0, remark='no usable proposal (nan): doing nothing')
     """
     request, mask = proposal.action, proposal.mask
-    if is_usable(actions, request) and (mask is None or mask[int(request)]):
+    if is_usable(actions, request, mask):
         action = put_into(actions, request)
         if same_action(action, request):
             return Usable(action, "")
@@ -161,6 +162,7 @@ class ActionReviser:
         self.risk = risk
         self.fallback = risk.fallback  #: what is done without a usable proposal
         self.actions = actions
+        self._refuse_unusable("fallback", self.fallback.action)
         self.tolerance = probability("tolerance", tolerance)
         self.mode = Mode(mode)
         #: Why proposals pass in this episode although it might act; empty where they need not.
@@ -222,34 +224,54 @@ class ActionReviser:
     ) -> Search:
         """Which option should be executed: the judge's own, or the best of those it is given."""
         if self._searches:
-            options, judgement, best, reason = self.risk.search(  # type: ignore[attr-defined]
-                situation, wanted, tolerance=self.tolerance, mask=mask
-            )
-            self.refuses = best != 0
-            within = np.minimum(np.maximum(options, self._low), self._high)
-            return Search(within, judgement, best, reason)
+            how = {"tolerance": self.tolerance, "mask": mask}
+            search = self.risk.search(situation, wanted, **how)  # type: ignore[attr-defined]
+            return self._checked(search, wanted, mask)
         options = np.minimum(np.maximum(wanted, self._lowest), self._highest)
         if mask is not None:
             options = options[np.append(True, mask)]
         if not acts:
             options = self.risk.effective(situation, options)
         if self.risk.trial() is None:  # most proposals are kept: this one is looked at first
-            judgement = self._judged(situation, options[:1])
+            judgement = self._judged(self.risk.judge(situation, options[:1]), 1)
             if judgement.risk[0] <= self.tolerance * (_RELEASE if self.refuses else 1.0):
                 self.refuses = False
                 return Search(options[:1], judgement, 0, _KEPT)
-        judgement = self._judged(situation, options)
+        judgement = self._judged(self.risk.judge(situation, options), len(options))
         return Search(options, judgement, *self._decide(situation, options, judgement, acts))
 
-    def _judged(self, situation: Situation, options: NDArray[np.float64]) -> Judgement:
-        """What the judge says, if it is a judgement of these options."""
-        judgement = self.risk.judge(situation, options)
+    def _judged(self, judgement: Judgement, count: int) -> Judgement:
+        """What the judge said, if it is a judgement of so many options."""
         risk = np.asarray(getattr(judgement, "risk", None), np.float64)
-        if risk.shape != (len(options),) or any(p < 0.0 or p > 1.0 for p in risk.tolist()):
-            name, count = f"{type(self.risk).__name__}.judge", len(options)
+        is_fit = risk.shape == (count,) and len(judgement.low) == len(judgement.high) == count
+        if not is_fit or any(p < 0.0 or p > 1.0 for p in risk.tolist()):
+            name = f"{type(self.risk).__name__}.judge"
             text = f"{name} gave {judgement!s:.200} of {count} actions; it has to give a Judgement"
             raise ValueError(f"{text} with a risk in [0, 1], or NaN, of each")
-        return judgement._replace(risk=risk)
+        return judgement if judgement.risk is risk else judgement._replace(risk=risk)
+
+    def _checked(self, search: Search, wanted: Action, mask: Mask | None) -> Search:
+        """What a judge found that looks for an action itself, if that may be executed."""
+        try:
+            options = np.minimum(np.maximum(search.options, self._low), self._high)
+            judgement, best = self._judged(search.judged, len(options)), operator.index(search.best)
+            is_usable_one = best >= 0 and is_usable(self.actions, options[best], mask)
+            if is_usable_one and same_action(options[0], wanted):
+                self.refuses = best != 0
+                return Search(options, judgement, best, search.reason)
+        except (AttributeError, IndexError, TypeError, ValueError):
+            pass  # what it is instead is said
+        raise ValueError(
+            f"{type(self.risk).__name__}.search gave {search!s:.200}; it has to give a Search: "
+            f"the proposal, {wanted}, as the first of its options, the index of one that is "
+            "allowed as best, and as judged a risk in [0, 1], or NaN, of each"
+        )
+
+    def _refuse_unusable(self, name: str, action: Action) -> None:
+        """Raise if what the judge names is not an action, put at the edge of the set or not."""
+        if not is_usable(self.actions, put_into(self.actions, action)):
+            text = f"{type(self.risk).__name__}.{name} is {action}"
+            raise ValueError(f"{text}; it has to be one of {self.actions}")
 
     def _decide(
         self, situation: Situation, options: NDArray[np.float64], judged: Judgement, acts: bool
@@ -275,8 +297,10 @@ class ActionReviser:
         # Once revising, what is safe by the margin; else whatever is tolerable.
         choice = self.risk.choose(situation, options, judged, (limit, self.tolerance))
         if choice is not None:
-            self.refuses = choice[0] != 0
-            return choice[0], f"{why}; {choice[1]}"
+            name = f"{type(self.risk).__name__}.choose: option"
+            best = check_index(name, choice[0], len(options))
+            self.refuses = best != 0
+            return best, f"{why}; {choice[1]}"
         change = distances(self.actions, options, options[0])
         # Of several that are least risky the closest to the proposal, unless to brake is better.
         rank = options if getattr(self.risk, "lowest_first", False) else change
@@ -289,6 +313,7 @@ class ActionReviser:
         return least, f"{why}; nothing can, the least risky"
 
     def _closest_to(self, action: Action, options: NDArray[np.float64]) -> int:
+        self._refuse_unusable("trial", action)
         return int(distances(self.actions, options, action).argmin())
 
 
