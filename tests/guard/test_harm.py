@@ -159,7 +159,7 @@ class Cautious(ObservingJudge):
         self.ends.append((failed, terminated))
 
 
-def test_a_judge_of_ones_own_sees_all_and_is_found_to_do_harm():
+def test_a_judge_of_ones_own_sees_all_and_is_found_to_do_harm(tmp_path):
     judge = Cautious()
     guard = make(judge=judge)
     rows = drive(guard, 12)
@@ -170,6 +170,8 @@ def test_a_judge_of_ones_own_sees_all_and_is_found_to_do_harm():
     assert judge.ends == [(True, False)] * 12
     with pytest.warns(UserWarning, match="was not shown to help: frozen so, proposals pass"):
         guard.freeze()
+    with pytest.raises(ValueError, match=r"^Cautious.save does not keep harm"):
+        guard.save(tmp_path / "guard")
 
 
 # -- Which is better -----------------------------------------------------------------------------

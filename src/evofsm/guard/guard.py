@@ -1015,5 +1015,10 @@ def _bytes(saved: EvolvingFSM | LearningJudge | None) -> NDArray[np.uint8]:
     file = BytesIO()
     if saved is not None:
         saved.save(file)
-        type(saved).load(BytesIO(file.getvalue()))
+        again: Any = type(saved).load(BytesIO(file.getvalue()))
+        if isinstance(saved, ObservingJudge):
+            rows, harm = (j and (*j.harm[1:], j.harm.rows.tolist()) for j in (again, saved))
+            if rows != harm:
+                use = "by which a loaded guard knows whether to act"
+                raise ValueError(f"{type(saved).__name__}.save does not keep harm, {use}")
     return np.frombuffer(file.getvalue(), np.uint8)
