@@ -117,6 +117,8 @@ def test_a_setting_that_cannot_be_right(name, value):
     words = r"must be a positive(, finite number| integer)|must lie below 1"
     with pytest.raises(ValueError, match=rf"{name} is .*; it ({words})"):
         EvolvingFSM(**{"n_actions": 2, name: value})
+    with pytest.raises(AttributeError, match=f"{name}.* (read only|no setter)"):
+        setattr(EvolvingFSM(2), name, value)
 
 
 # -- Masked arrays -----------------------------------------------------------------------------

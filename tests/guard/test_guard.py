@@ -435,6 +435,16 @@ def test_what_makes_no_guard_is_refused(settings, message):
         Guard(**({"interval": DT, "judge": Balance()} | settings))
 
 
+def test_settings_of_the_reviser_are_looked_at_where_they_are_set():
+    guard = continuous()
+    guard.mode, guard.reviser.tolerance = "shadow", 0.5
+    assert (guard.reviser.mode, guard.tolerance) == (Mode.SHADOW, 0.5)
+    for one in (guard, guard.reviser):
+        for name, value in (("mode", "on"), ("tolerance", 5.0), ("tolerance", math.nan)):
+            with pytest.raises(ValueError, match=f"^{name} is"):
+                setattr(one, name, value)
+
+
 def test_a_machine_of_other_actions_is_refused():
     with pytest.raises(ValueError, match="the machine has 4 actions, but the set has 17"):
         guard_for_cars(-2.5, 2.5, machine=EvolvingFSM(4))

@@ -14,6 +14,8 @@ from __future__ import annotations
 import copy
 import warnings
 from collections.abc import Mapping, Sequence
+from functools import partial
+from operator import methodcaller
 from typing import Any, Self, SupportsIndex
 
 import numpy as np
@@ -368,9 +370,6 @@ class EvolvingFSM(Retraced):
             return getattr(self.model(), name).copy()
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
 
-    def __dir__(self) -> list[str]:
-        return [*super().__dir__(), *_ASKED, *_LIMITS, *Settings._fields]
-
     @property
     def settings(self) -> dict[str, Any]:
         """Its settings by name, but for the rule; those that were left as they are, left out."""
@@ -585,6 +584,15 @@ class EvolvingFSM(Retraced):
             if _MANY_STATES <= n < 1.5 * _MANY_STATES and n_observations < 2 * n:  # once
                 warnings.warn(_TOO_FINE.format(n, n_observations), RuntimeWarning, stacklevel=4)
             self._learnt = arrays.resized(self._learnt, *room)
+
+
+def _refuse(name: str, *_: object) -> None:
+    raise AttributeError(f"{name} of a machine is read only: settings are given as it is made")
+
+
+for _name in {*_ASKED, *_LIMITS, *Settings._fields}.difference(dir(EvolvingFSM)):
+    _answer = methodcaller("__getattr__", _name)
+    setattr(EvolvingFSM, _name, property(_answer, partial(_refuse, _name), doc=""))
 
 
 def opened(machine: EvolvingFSM) -> tuple[Learnt, Settings]:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache, partial
 from io import BytesIO
+from operator import attrgetter
 from typing import Any, Protocol, Self, SupportsFloat
 
 import numpy as np
@@ -115,6 +116,12 @@ KIND = Kind(
         "judge": str | None,
     },
 )
+
+
+def _of_reviser(name: str) -> Any:
+    """A setting of a guard's reviser, which may be changed by the guard, too."""
+    read = attrgetter(f"reviser.{name}")
+    return property(read, lambda guard, value: setattr(guard.reviser, name, value), doc="")
 
 
 class Guard:
@@ -335,7 +342,7 @@ class Guard:
         self.judge = judge
         self.failed = failed
         self.audit: DecisionLogger | None = audit
-        self.explaining = explaining
+        self.explaining = truth("explaining", explaining)
         labels = Labels() if action_judge is None else action_judge.labels
         #: What the judge calls the variables of an observation; empty where it does not say.
         self.variables: tuple[str, ...] = labels.names
@@ -351,8 +358,10 @@ class Guard:
         self._begun = self._decisions = self._acted = self._watched = self._kept = 0
         self._lacking = 0  # observations since one was whole
         #: Whether proposals pass in some or all episodes where it was not shown to help.
-        self.shadow = bool(shadow)
+        self.shadow = truth("shadow", shadow)
         self.learn = learn
+
+    mode, tolerance = map(_of_reviser, ("mode", "tolerance"))
 
     @property
     def learn(self) -> bool:

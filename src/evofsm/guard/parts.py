@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
-from evofsm.fsm.validation import probability
 from evofsm.guard.actions import ActionSet, BoxActions, Choices
 from evofsm.guard.api import ActionJudge, LearningJudge, Reviser
-from evofsm.guard.reviser import ActionReviser, Mode
+from evofsm.guard.reviser import ActionReviser
 
 # Guards import this module, so that it cannot import them.
 _Guard = Any
@@ -112,5 +111,4 @@ def settings_of(reviser: Reviser) -> dict[str, Any]:
 def set_again(reviser: Reviser, settings: Mapping[str, Any]) -> None:
     """Give a reviser the `settings_of` another time."""
     if isinstance(reviser, ActionReviser):
-        tolerance = probability("tolerance", float(settings["tolerance"]))
-        reviser.mode, reviser.tolerance = Mode(settings["mode"]), tolerance
+        reviser.tolerance, reviser.mode = settings["tolerance"], settings["mode"]

@@ -11,7 +11,7 @@ import operator
 import warnings
 from enum import Enum
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,6 +70,10 @@ class Mode(Enum):
     @classmethod
     def _missing_(cls, value: object) -> None:
         raise ValueError(f"mode is {value!r}; it is one of {', '.join(m.value for m in cls)}")
+
+
+# What makes a setting of what it is set to, or refuses it.
+_SETTABLE: dict[str, Any] = {"mode": Mode, "tolerance": partial(probability, "tolerance")}
 
 
 class Usable(NamedTuple):
@@ -163,8 +167,8 @@ class ActionReviser:
         self.fallback = risk.fallback  #: what is done without a usable proposal
         self.actions = actions
         self._refuse_unusable("fallback", self.fallback.action)
-        self.tolerance = probability("tolerance", tolerance)
-        self.mode = Mode(mode)
+        self.tolerance = tolerance
+        self.mode = mode
         #: Why proposals pass in this episode although it might act; empty where they need not.
         self.passing = ""
         self._searches = isinstance(risk, SearchingJudge)
@@ -172,6 +176,9 @@ class ActionReviser:
         self._low, self._high = limits(actions)
         self._far, self._clipped = _CLEARLY * (self._high - self._low), 0
         self.start_episode()
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        super().__setattr__(name, _SETTABLE[name](value) if name in _SETTABLE else value)
 
     def start_episode(self) -> None:
         """Nothing is under way yet."""
