@@ -269,7 +269,11 @@ def run(system: System, judge: Any, start: Start, controller: Any = None) -> End
     for one in run_episode(system, judge, controller or system, options={"start": start}):
         executed, proposed = one.revision.executed, system.proposed
         times.append(one.seconds)
-        kept += np.array_equal(executed, proposed)
+        is_kept = np.array_equal(executed, proposed)
+        if not is_kept and not system.actions.holds(executed):
+            change = f"executed {executed!r} in place of {proposed!r}"
+            raise ValueError(f"{type(judge).__name__} {change}, which is none of {system.actions}")
+        kept += is_kept
         changes += system.actions.change(executed, proposed)
     steps = len(times) if one.failed else system.steps
     of_all = (kept, changes, times, system.speed)
@@ -427,7 +431,7 @@ _NOTE = (
     "Pearson as if they were independent. Failed while learning, late, p99: of the worst seed. "
     "Score: mobility of cars, else the sum of rewards, of the seed in the middle, with a bootstrap "
     "interval over episodes. Kept: proposals that were executed exactly; change: of the action, in "
-    "halves of its range. Times are those of a machine with all cores at work."
+    "halves of its range. Times depend on the machine, and on --workers."
 )
 _NOTE_BESIDE = (
     " Alone: the controller without a guard, in the same draws. Steps: to failure; without one as "

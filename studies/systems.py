@@ -79,6 +79,11 @@ class Box:
             return {"low": self.low[0], "high": self.high[0]}
         return {"low": np.array(self.low), "high": np.array(self.high)}
 
+    def holds(self, action: Action) -> bool:
+        """Whether it is one of them, but for rounding; NaN is none."""
+        beyond = np.maximum(np.subtract(self.low, action), np.subtract(action, self.high))
+        return np.size(action) == len(self.low) and bool((beyond < 1e-6).all())
+
     def change(self, executed: Action, proposed: Action) -> float:
         """Mean absolute difference, in halves of the range."""
         half = 0.5 * (np.array(self.high) - np.array(self.low))
@@ -100,6 +105,10 @@ class Discrete:
     def settings(self) -> dict[str, Any]:
         """What a guard is given of them."""
         return {"n_actions": self.n_actions}
+
+    def holds(self, action: Action) -> bool:
+        """Whether it is one of them."""
+        return action in range(self.n_actions)
 
     def change(self, executed: Action, proposed: Action) -> float:
         """1 where another action is executed."""
@@ -142,14 +151,13 @@ class System(ABC):
     def chosen(self, wanted: str) -> list[str]:
         """Names of its controllers that are ``wanted``: some with commas, `ALL` or `FIRST`."""
         known = list(self.controllers)
-        if wanted in (ALL, FIRST):
+        if known and wanted in (ALL, FIRST):
             return known if wanted == ALL else known[:1]
         named = list(dict.fromkeys(names_in(wanted))) or [wanted]
         for name in named:
             if name not in known:
-                raise ValueError(
-                    f"{self.name} has no controller {name!r}; it has {', '.join(known)}"
-                )
+                names = ", ".join(known) or "none: give it some in `controllers`"
+                raise ValueError(f"{self.name} has no controller {name!r}; it has {names}")
         return named
 
     def reset(

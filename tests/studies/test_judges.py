@@ -7,8 +7,9 @@ import numpy as np
 import polars as pl
 import pytest
 from studies import benchmark, judges
-from studies.judges import PARTS, Judges, Tasks, taken_out, trial
+from studies.judges import PARTS, Judges, Tasks, run, taken_out, trial
 from studies.rivals import Rival
+from studies.systems import Start, make_system
 
 from evofsm.guard.learnt import model
 
@@ -117,6 +118,15 @@ def test_what_has_no_switch_is_taken_out_as_long_as_it_is_asked():
 
 
 # -- Tasks and judges of one's own ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("wrong", [np.nan, -8.0, [1.0, 1.0]])
+def test_what_a_judge_executes_is_an_action(wrong):
+    judge = type("Rude", (Rival,), {"action": lambda *_: wrong})()
+    with pytest.raises(
+        ValueError, match=r"^Rude executed .* in place of 2.0, which is none of Box"
+    ):
+        run(make_system("acc"), judge, Start.held_out(0, 0))
 
 
 @pytest.mark.slow
