@@ -67,6 +67,9 @@ def test_states_over_rows_have_their_reach_and_their_ways_on_in_frame():
     machine.learn_many(rows[:4], [0] * 4)
     failed = np.arange(5) == 4
     ax = plot.states(machine.model(), new(), rows=rows, failed=failed, ways=True)
+    for wrong in (failed[:3], [5]):
+        with pytest.raises((TypeError, ValueError), match="failed"):
+            plot.states(machine.model(), new(), rows=rows, failed=wrong)
     legend = [text.get_text() for text in ax.get_legend().get_texts()]
     assert legend == ["observed", "failed", "where a state reaches", "likeliest ways on", "state"]
     ends = zip(ax.axis()[::2], rows.min(0), rows.max(0), ax.axis()[1::2], strict=True)
@@ -81,7 +84,7 @@ def test_states_over_rows_have_their_reach_and_their_ways_on_in_frame():
 def test_a_few_spikes_do_not_set_the_axes_and_where_it_alarms_is_tinted():
     rows = np.column_stack([np.linspace(2.0, 7.0, 400), np.linspace(50.0, 90.0, 400)])
     rows = np.vstack([rows, [[7.6, 97.0], [-999.0, 60.0], [5.0, 4000.0]]])
-    failed = np.arange(len(rows)) >= 400
+    failed = range(400, len(rows))
     machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=1.0, scales=[2.0, 20.0]))
     machine.learn_many(rows, [0] * len(rows), [0], [len(rows) - 1])
     limits = np.array([[0, 0, 1, 0, 1, 92.0]])  # of the heat, which is the second variable

@@ -18,7 +18,7 @@ from evofsm.fsm.clusters import NOVELTY
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.proportions import usual_range
 from evofsm.fsm.rules import reach, weights_of
-from evofsm.fsm.validation import check_index
+from evofsm.fsm.validation import check_index, check_rows
 from evofsm.guard import Guard, LearntRisk
 from evofsm.guard.foresight import DATES
 from evofsm.guard.learnt.failure import HELD, SAYS, SIZE, I, J, distances, telling
@@ -83,8 +83,8 @@ def states(
         Indices of states to mark by a hexagon, as `dead_ends_of` finds them.
     rows : (T, m) array_like, optional
         What was observed, as dots behind.
-    failed : (T,) array_like of bool, optional
-        With which of them an episode failed: crosses.
+    failed : (T,) array_like of bool, or of int, optional
+        With which of them an episode failed, or their numbers: crosses.
     ways : bool
         Whether to show how far each state of a `Novelty` reaches (an ellipse), the two likeliest
         ways out of each, as wide as they are likely, and a legend.
@@ -113,7 +113,9 @@ def states(
     ax = _given_or_new(ax)
     box = [ax.dataLim.frozen()] if ax.has_data() else []
     centers, dots = model.centers[:, pair], np.reshape(rows, (-1, model.n_variables))[:, pair]
-    fails = np.resize(np.asarray(failed, np.bool_), len(dots)) & bool(np.size(failed))
+    fails = np.asarray(failed)
+    if fails.dtype != np.bool_ or fails.shape != (len(dots),):
+        fails = check_rows("failed", failed, len(dots))
     times = np.ceil(_GRID**2 * model.visits / max(float(model.visits.sum()), 1.0)).astype(int)
     every = dots if len(dots) else centers.repeat(times, axis=0)
     ends = np.transpose([usual_range(x, y) for x, y in zip(every.T, dots[fails].T, strict=True)])
