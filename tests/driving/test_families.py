@@ -186,6 +186,8 @@ def test_a_file_of_ones_own_is_a_family_with_switches_and_in_other_processes(min
         ("make, -3.0", "make, -4.0", "can brake by 4 m/s², but decel is 3; bound its body"),
         ("brake_time=10.0", "brake_time=-1.0", r"mine\.py.*: leader's brake_time is -1"),
         ("initial_gap=20.0", "initial_gap='far'", r"mine\.py, line \d+, in make: TypeError: "),
+        ("speed), calm", "speed), max", "who drives is .*; make gives an IDM or ChangingIDM"),
+        ("10.0, 20.0", "20.0, 10.0", r"values\.speed is drawn from 20\.0 to 10\.0"),
         ("return Scenario", "return Scene", r"mine\.py, line .*: NameError: .*Scene"),
         ("family = Family", "mine = Family", "it defines no Family that is called family"),
         ("def make", "def", r"mine\.py: SyntaxError"),

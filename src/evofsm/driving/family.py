@@ -80,6 +80,8 @@ class Numbers:
         low, high : float
             Ends of the range.
         """
+        if not low <= high:
+            raise ValueError(f"{place} is drawn from {low} to {high}; the lower end comes first")
         return float(self._stream(place).uniform(low, high))
 
     def below(self, place: str, n: int) -> int:
@@ -203,6 +205,8 @@ class Family:
                 f"{where}: a leader brakes by {leader_brakes:g} m/s², but leader_decel is "
                 f"{self.leader_decel:g}"
             )
+        if not isinstance(driver, IDM | ChangingIDM):
+            raise ValueError(f"{where}: who drives is {driver!r}; make gives an IDM or ChangingIDM")
         lowest_command = min(self.low, float(driver.parameters[:, 7].min()))
         brakes = -max(scenario.body.lowest, lowest_command)
         if brakes > self.decel + _ROUNDING:
