@@ -94,6 +94,10 @@ def test_failures_of_a_batch_that_cannot_be_right(grown):
         refuses(grown, lambda m, rows=failures: m.learn_many(ROWS, [0] * 3, [], rows), error, words)
 
 
+def test_a_failure_that_is_neither_true_nor_false(machine):
+    refuses(machine, lambda m: m.observe([0.0, 1.0], failed="no"), TypeError, "failed is 'no'")
+
+
 def test_a_failure_before_any_observation():
     refuses(EvolvingFSM(3), EvolvingFSM.fail, ValueError, "fail before observe")
 

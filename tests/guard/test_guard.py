@@ -21,7 +21,7 @@ from evofsm.driving.judge import LatentRisk
 from evofsm.guard.actions import Choices, put_into, same_action
 from evofsm.guard.api import ActionJudge, Fallback, Judgement, Proposal, Search
 from evofsm.guard.guard import KIND
-from evofsm.guard.reviser import Mode
+from evofsm.guard.reviser import ActionReviser, Mode
 from evofsm.guard.scene import SceneRisk
 
 DT = 0.1
@@ -314,8 +314,10 @@ def test_what_a_file_cannot_hold_has_to_be_given_again(tmp_path):
     with pytest.raises(ValueError, match="give the judge's class"):
         Guard.load(path, failed=lambda z: False)
     assert Guard.load(path, judge=Balance, failed=lambda z: z[0] > 1.0).failed is not None
-    with pytest.raises(ValueError, match="no reviser that a file can hold"):
-        Guard.of(SimpleNamespace(actions=Choices(2)), interval=DT).save(path)
+    own = type("Own", (Choices,), {})(5)
+    for part in (SimpleNamespace(actions=Choices(2)), ActionReviser(Balance(index=True), own)):
+        with pytest.raises(ValueError, match=r"no file can hold .* of (Choices|Own)"):
+            Guard.of(part, interval=DT).save(path)
     with pytest.raises(ValueError, match="holds a guard, not a machine"):
         EvolvingFSM.load(path)
 
@@ -414,6 +416,7 @@ def test_a_search_keeps_to_what_is_allowed():
         *(({"low": -1.0, "high": 1.0, "interval": dt}, "interval") for dt in (0.0, -1.0, math.nan)),
         ({"low": -1.0, "high": 1.0, "failed": True}, r"failed is .*; it must be a function"),
         ({"low": -1.0, "high": 1.0, "mode": "on"}, "mode is 'on'; it is one of off, shadow, act"),
+        ({"low": -1.0, "high": 1.0, "judge": Balance}, "must be an object with a method judge"),
         ({"low": -1.0, "high": 1.0, "audit": "log.jsonl"}, "has no method decided"),
         ({"low": -1.0, "high": 1.0, "judge": None, "names": "ab"}, "names is 'ab'; it must be"),
         ({"low": [0.0, 0.0], "high": [1.0], "judge": None}, "low has 2 components and high has 1"),

@@ -174,6 +174,7 @@ class EvolvingFSM(Retraced):
             If ``z`` holds no real numbers of at most 1e100, or has another length than before. The
             machine is then as it was.
         """
+        failed = None if failed is None else valid.truth("failed", failed)
         if partial:
             vector = valid.real_array("observation", z, ndim=1)
             if (absent := np.isnan(vector)).any():

@@ -232,6 +232,9 @@ class FSMModel:
         path, provenance
             As `EvolvingFSM.save` takes them.
         """
+        if type(self.actions) not in (IntervalActions, type(None)):
+            name = type(self.actions).__name__
+            raise ValueError(f"actions are {name}, which a file would hold as IntervalActions")
         arrays = {name: getattr(self, name) for name in OF_MODEL}
         store.write(path, MODEL, self._content, arrays, provenance)
 

@@ -173,7 +173,7 @@ def describe_rule(rule: StateRule) -> dict[str, Any]:
             settings = [part.name for part in fields(_RULES[name])]
             return {"name": name} | {part: getattr(rule, part) for part in settings}
     names = ", ".join(f"{kind.__name__}(...)" for kind in _RULES.values())
-    raise TypeError(f"rule is {rule!r}; it must be an object: {names}")
+    raise TypeError(f"rule is {rule!r}; it must be an object: {names}, or of register_rule")
 
 
 def restore_rule(description: Mapping[str, Any] | None) -> StateRule:

@@ -80,6 +80,13 @@ def number(name: str, value: object, hint: str = "") -> float:
     raise TypeError(f"{name} is {value!r}; it must be a number{hint}")
 
 
+def truth(name: str, value: Any) -> bool:
+    """True or False, NumPy's as well."""
+    if np.ndim(value) or np.asarray(value).dtype != np.bool_:
+        raise TypeError(f"{name} is {value!r}; it must be True or False, of one environment")
+    return bool(value)
+
+
 def probability(name: str, value: SupportsFloat) -> float:
     """A number between 0 and 1, neither included."""
     if positive(name, value) >= 1.0:

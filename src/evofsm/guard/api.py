@@ -234,9 +234,9 @@ class LearningJudge(ActionJudge, Protocol):
     """A judge that learns from what happens, and can be kept in a file.
 
     One that also learns from being asked, or tries actions, may have an attribute ``learning``: the
-    guard sets it to whether anything may be learnt. A method that raises should leave it as it was;
-    what others did in the same call a guard takes back where it has a method ``savepoint`` (see
-    `Guard`).
+    guard sets it to whether anything may be learnt; ``bridges``, ``n_variables``, ``uncovered`` and
+    ``told_by_experience`` it reads: call nothing else so. A method that raises should leave it as
+    it was; what others did in the same call a guard takes back where it has a method ``savepoint``.
     """
 
     dt: float  #: time between decisions [s]
@@ -281,10 +281,10 @@ class LearningJudge(ActionJudge, Protocol):
 
 @runtime_checkable
 class ObservingJudge(LearningJudge, Protocol):
-    """A learning judge that is shown each observation, asked or not, and may be found to do harm.
+    """A learning judge that, while it learns, sees each observation, asked or not.
 
-    While it learns, the controller drives some episodes alone (`evofsm.guard.harm`). Its `save`
-    keeps `harm`.
+    Meanwhile the controller drives some episodes alone, and it may be found to do harm
+    (`evofsm.guard.harm`). Its `save` keeps `harm`. Frozen, it is shown decisions alone (`follow`).
     """
 
     harm: Harm  #: how episodes ended, guarded and alone: `Harm()` at first, then the guard's

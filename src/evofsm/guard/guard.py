@@ -26,7 +26,7 @@ from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import Labels, in_a_line
 from evofsm.fsm.rules import reach
 from evofsm.fsm.sharing import Rollback, alone, share, transaction
-from evofsm.fsm.validation import function, number, positive, real_array, usable_array
+from evofsm.fsm.validation import function, number, positive, real_array, truth, usable_array
 from evofsm.guard.actions import (
     Action,
     ActionSet,
@@ -233,8 +233,8 @@ class Guard:
         shadow: bool = True,
     ) -> None:
         actions = _actions(low, high, n_actions)
-        if not (judge is None or hasattr(judge, "judge")):
-            raise TypeError(f"judge is {judge!r}, which has no method judge")
+        if isinstance(judge, type) or not (judge is None or hasattr(judge, "judge")):
+            raise TypeError(f"judge is {judge!r}; it must be an object with a method judge")
         interval = positive("interval", interval)
         soon = None if horizon is None else max(1, round(positive("horizon", horizon) / interval))
         arguments: dict[str, Any] = {"model": model, "backup": backup, "names": names}
@@ -329,9 +329,8 @@ class Guard:
         if machine is not None and machine.n_actions != self.actions.n_actions:
             counts = f"{machine.n_actions} actions, but the set has {self.actions.n_actions}"
             raise ValueError(f"the machine has {counts}")
-        if hasattr(action_judge, "failed"):
+        if isinstance(action_judge, LearntRisk):
             action_judge.failed = None if failed is None else partial(asked, failed)
-        if hasattr(action_judge, "warm"):
             action_judge.warm()
         if machine is not None:
             _warm_machine()
@@ -884,7 +883,12 @@ class Guard:
         """
         parts = outline(self)
         if parts["reviser"] is None:
-            raise ValueError(f"a {type(self.reviser).__name__} is no reviser that a file can hold")
+            names = f"{type(self.reviser).__name__} of {type(self.actions).__name__}"
+            raise ValueError(
+                f"no file can hold {names}: a reviser and what it is made of are classes that "
+                "evofsm.participants declares, with methods described and restored, its set of "
+                "actions is one of evofsm"
+            )
         settings = {
             **parts,
             "failed": self.failed is not None,
@@ -977,13 +981,6 @@ def ends_of(judge: ActionJudge | None, m: int) -> NDArray[np.float64]:
 @cache
 def _resized(ranges: tuple[tuple[float, float], ...], m: int) -> NDArray[np.float64]:
     return np.resize(ranges, (m, 2)).T
-
-
-def truth(name: str, value: Any) -> bool:
-    """True or False, NumPy's as well."""
-    if np.ndim(value) or np.asarray(value).dtype != np.bool_:
-        raise TypeError(f"{name} is {value!r}; it must be True or False, of one environment")
-    return bool(value)
 
 
 def answered(reply: Any) -> bool:

@@ -52,9 +52,11 @@ def outline(guard: _Guard) -> dict[str, Any]:
         asks = judge is not None and reviser.risk is guard.judge  # a known one that learns
         settings = settings_of(reviser)
         description = {"class": "ActionReviser", "asks_judge": asks, "settings": settings}
-    elif name := part_name(reviser):
+    elif (name := part_name(reviser)) and hasattr(reviser, "described"):
         made_of = reviser.described()
         description = None if made_of is None else {"class": name, **made_of}
+    if type(guard.actions) not in (IntervalActions, Choices, BoxActions):
+        description = None  # it would be made again as another
     return {"actions": asdict(guard.actions), "judge": judge, "reviser": description}
 
 
