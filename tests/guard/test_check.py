@@ -10,13 +10,14 @@ import pytest
 from evofsm import IntervalActions, Novelty, Paper
 from evofsm.driving import IDM, EnvelopeReviser, LatentRisk, Unrevised
 from evofsm.driving.measures import ModifiedTimeToCollision
-from evofsm.guard import ActionReviser, Mode, Proposal
+from evofsm.guard import ActionReviser, LearntRisk, Mode, Proposal
 from evofsm.guard.check import check_results, kind_of
 
 ACTIONS = IntervalActions(-2.5, 2.5, 0.3)
 CALM = IDM(1.0, 25.0, 2.0, 1.5, 2.0, lowest=-5.0)
 
 OURS = [
+    LearntRisk(0.25, n_actions=3),
     Paper,
     Novelty(radius=1.5, scales=(2.0, 0.5), spread=0.7),
     LatentRisk(lowest=-2.5),

@@ -9,17 +9,22 @@ import copy
 import inspect
 import math
 import traceback
+import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import FrozenInstanceError, fields, is_dataclass
 from io import BytesIO
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.validation import Floats
+from evofsm.guard.actions import ActionSet, BoxActions, Choices, limits
 from evofsm.guard.api import Judgement, Proposal, Revision, Situation
 from evofsm.guard.guard import Guard, ends_of
+from evofsm.guard.reviser import ActionReviser
 
 Make = Callable[[], Any]
 Rows = Sequence[Floats]
@@ -28,6 +33,15 @@ Clause = Callable[[Make], None]
 
 _DT = 0.25  # between two rows [s]
 _ACTIONS = np.array([-2.5, -0.7, 0.0, 1.3, 2.5])
+# A judge is tried with the first that it takes.
+_SETS: tuple[ActionSet, ...] = (
+    *(
+        IntervalActions(low, high, 0.1, "clip")
+        for low, high in ((-2.5, 2.5), (-1.0, 1.0), (0.0, 1.0))
+    ),
+    *map(Choices, range(2, 10)),
+    *(BoxActions((-1.0,) * d, (1.0,) * d) for d in (2, 1, 3)),
+)
 
 
 class Result(NamedTuple):
@@ -42,8 +56,9 @@ def check_results(part: object) -> list[Result]:
     """What each check of its contract finds, in order.
 
     The part is a class that is made without arguments, an instance (copied before each check), or a
-    function that makes one. A TypeError if it has the methods of no kind, or a class needs
-    arguments.
+    function that makes one. A judge is tried with the first of several sets of actions that it
+    takes, or its attribute ``actions``. A TypeError if it has the methods of no kind, or a class
+    needs arguments.
     """
     make = _maker(part)
     return [_result(clause, make) for clause in _CONTRACTS[kind_of(part)][1]]
@@ -198,38 +213,56 @@ def an_episode_starts_anew(make: Make) -> None:
     _insist(_same(outputs, reference), "after start_episode it still depends on the episode before")
 
 
+def _actions(judge: Any) -> tuple[ActionSet, Floats]:
+    """A set of actions that a judge takes, its own ``actions`` if it has such, and five of them."""
+    first = getattr(judge, "actions", _SETS[0])
+    for actions in (first, *_SETS, first):
+        samples = np.linspace(*limits(actions), 5)
+        samples = np.rint(samples) if isinstance(actions, Choices) else samples
+        with suppress(Exception):
+            (another := copy.deepcopy(judge)).refuse_unfit(actions)
+            another.judge(_situation(_drive(1, judge=judge)[0], 1), samples)
+            break
+    return actions, samples
+
+
 def _judgements(judge: Any, rows: Rows) -> Answers:
-    judgements = (judge.judge(_situation(row, 1), _ACTIONS.copy()) for row in rows)
+    samples = _actions(judge)[1]
+    judgements = (judge.judge(_situation(row, 1), samples.copy()) for row in rows)
     return [(judgement.risk, judgement.low, judgement.high) for judgement in judgements]
 
 
 def _taught(make: Make, *, ask: bool = False) -> tuple[Guard, Any]:
     """A guard with the judge, after episodes of which every other one failed."""
     judge = make()
-    guard = Guard(_ACTIONS[0], _ACTIONS[-1], interval=getattr(judge, "dt", _DT), judge=judge)
+    actions = _actions(judge)[0]
+    reviser, machine = ActionReviser(judge, actions), EvolvingFSM(actions.n_actions)
+    guard = Guard.of(reviser, interval=getattr(judge, "dt", _DT), machine=machine)
     _go_on(guard, judge, range(6), ask=ask)
     return guard, judge
 
 
 def _go_on(guard: Guard, judge: Any, episodes: range, *, ask: bool = False) -> None:
+    samples = _actions(judge)[1]
     for episode in episodes:
         rows, failed = _drive(seed=episode, judge=judge), episode % 2 == 0
         for k, row in enumerate(rows):
             if ask:
-                judge.why(judge.judge(_situation(row, 0), _ACTIONS))
-            guard.decide(row, float(_ACTIONS[k % len(_ACTIONS)]), k * _DT)
+                judge.why(judge.judge(_situation(row, 0), samples))
+            guard.decide(row, samples[k % len(samples)], k * _DT)
         guard.end(failed, rows[-1])
 
 
 def _asked(judge: Any) -> list[Judgement]:
-    return [judge.judge(_situation(row, 0), _ACTIONS.copy()) for row in _drive(8, 99, judge)]
+    samples = _actions(judge)[1]
+    return [judge.judge(_situation(row, 0), samples.copy()) for row in _drive(8, 99, judge)]
 
 
 def judges_each_action(make: Make) -> None:
     """It returns a probability for each action, within its interval, or NaN where it knows none."""
     for judgement in _asked(_taught(make)[1]):
         shapes = {np.shape(getattr(judgement, name)) for name in ("risk", "low", "high")}
-        _insist(shapes == {_ACTIONS.shape}, f"of {len(_ACTIONS)} actions it returns {shapes}")
+        _insist(shapes == {(5,)}, f"of 5 actions it returns {shapes}")
         is_risk = ~np.isnan(judgement.risk)
         low, risk, high = judgement.low[is_risk], judgement.risk[is_risk], judgement.high[is_risk]
         sound = ((low >= 0.0) & (low <= risk) & (risk <= high) & (high <= 1.0)).all()
@@ -243,7 +276,8 @@ def learns_only_from_what_happens(make: Make) -> None:
     before = _asked(judge)
     text = "it learns otherwise where somebody else asks it too (does judge note what it is asked?)"
     _insist(_same(before, _asked(_taught(make, ask=True)[1])), text)
-    guard.freeze()
+    with warnings.catch_warnings(action="ignore"):  # of this guard, which is none of anybody's
+        guard.freeze()
     _go_on(guard, judge, range(10, 12))
     _insist(_same(before, _asked(judge)), "a frozen guard's judge went on learning")
 

@@ -212,10 +212,8 @@ def _command(model: FSMModel, state: int, action: int, least: float) -> Iterator
     chances = np.concatenate([[share], (1.0 - share) * row / row.sum()])
     parts: list[int] = np.rint(chances * 10**_DECIMALS).astype(np.int64).tolist()
     parts[int(np.argmax(parts))] += 10**_DECIMALS - sum(parts)  # to the last digit
-    comments = [
-        f"failed {failures:.4g}",
-        *(f"seen {count:g} by any action" for count in model.changes[state]),
-    ]
+    counts = [f"seen {count:g} by any action" for count in model.changes[state]]
+    comments = [f"failed {failures:.4g}", *counts]
     usage = f"a{action + 1} was used {model.uses[action]:,.0f} times"
     yield f"  [a{action + 1}] s={state + 1} -> // {decisions:.4g} decisions; {usage}"
     targets = np.flatnonzero(parts).tolist()
