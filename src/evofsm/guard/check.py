@@ -22,7 +22,7 @@ from evofsm.fsm.actions import IntervalActions
 from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.validation import Floats
 from evofsm.guard.actions import ActionSet, BoxActions, Choices, limits
-from evofsm.guard.api import Judgement, Proposal, Revision, Situation
+from evofsm.guard.api import Proposal, Revision, Situation
 from evofsm.guard.guard import Guard, ends_of
 from evofsm.guard.reviser import ActionReviser
 
@@ -35,10 +35,7 @@ _DT = 0.25  # between two rows [s]
 _ACTIONS = np.array([-2.5, -0.7, 0.0, 1.3, 2.5])
 # A judge is tried with the first that it takes.
 _SETS: tuple[ActionSet, ...] = (
-    *(
-        IntervalActions(low, high, 0.1, "clip")
-        for low, high in ((-2.5, 2.5), (-1.0, 1.0), (0.0, 1.0))
-    ),
+    *(IntervalActions(*ends, 0.1, "clip") for ends in ((-2.5, 2.5), (-1.0, 1.0), (0.0, 1.0))),
     *map(Choices, range(2, 10)),
     *(BoxActions((-1.0,) * d, (1.0,) * d) for d in (2, 1, 3)),
 )
@@ -226,12 +223,6 @@ def _actions(judge: Any) -> tuple[ActionSet, Floats]:
     return actions, samples
 
 
-def _judgements(judge: Any, rows: Rows) -> Answers:
-    samples = _actions(judge)[1]
-    judgements = (judge.judge(_situation(row, 1), samples.copy()) for row in rows)
-    return [(judgement.risk, judgement.low, judgement.high) for judgement in judgements]
-
-
 def _taught(make: Make, *, ask: bool = False) -> tuple[Guard, Any]:
     """A guard with the judge, after episodes of which every other one failed."""
     judge = make()
@@ -253,18 +244,21 @@ def _go_on(guard: Guard, judge: Any, episodes: range, *, ask: bool = False) -> N
         guard.end(failed, rows[-1])
 
 
-def _asked(judge: Any) -> list[Judgement]:
+def _judgements(judge: Any, rows: Rows) -> Answers:
     samples = _actions(judge)[1]
-    return [judge.judge(_situation(row, 0), samples.copy()) for row in _drive(8, 99, judge)]
+    return [judge.judge(_situation(row, 1), samples.copy())[:3] for row in rows]
+
+
+def _asked(judge: Any) -> Answers:
+    return _judgements(judge, list(_drive(8, 99, judge)))
 
 
 def judges_each_action(make: Make) -> None:
     """It returns a probability for each action, within its interval, or NaN where it knows none."""
-    for judgement in _asked(_taught(make)[1]):
-        shapes = {np.shape(getattr(judgement, name)) for name in ("risk", "low", "high")}
+    for risk, low, high in _asked(_taught(make)[1]):
+        shapes = {*map(np.shape, (risk, low, high))}
         _insist(shapes == {(5,)}, f"of 5 actions it returns {shapes}")
-        is_risk = ~np.isnan(judgement.risk)
-        low, risk, high = judgement.low[is_risk], judgement.risk[is_risk], judgement.high[is_risk]
+        low, risk, high = np.array([low, risk, high])[:, ~np.isnan(risk)]
         sound = ((low >= 0.0) & (low <= risk) & (risk <= high) & (high <= 1.0)).all()
         why = "probabilities lie in [0, 1], and in their interval"
         _insist(sound, f"its risks are {risk} within {low} to {high}; {why}")

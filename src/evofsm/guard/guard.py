@@ -884,11 +884,8 @@ class Guard:
         parts = outline(self)
         if parts["reviser"] is None:
             names = f"{type(self.reviser).__name__} of {type(self.actions).__name__}"
-            raise ValueError(
-                f"no file can hold {names}: a reviser and what it is made of are classes that "
-                "evofsm.participants declares, with methods described and restored, its set of "
-                "actions is one of evofsm"
-            )
+            needs = "evofsm.participants declares it and its parts, with described and restored"
+            raise ValueError(f"no file can hold {names}: {needs}; actions are evofsm's own")
         settings = {
             **parts,
             "failed": self.failed is not None,
@@ -1024,7 +1021,6 @@ def _bytes(saved: EvolvingFSM | LearningJudge | None) -> NDArray[np.uint8]:
         again: Any = type(saved).load(BytesIO(file.getvalue()))
         if isinstance(saved, ObservingJudge):
             rows, harm = (j and (*j.harm[1:], j.harm.rows.tolist()) for j in (again, saved))
-            if rows != harm:
-                use = "by which a loaded guard knows whether to act"
-                raise ValueError(f"{type(saved).__name__}.save does not keep harm, {use}")
+            if rows != harm:  # by which a loaded guard knows whether to act
+                raise ValueError(f"{type(saved).__name__}.save does not keep harm, or load it")
     return np.frombuffer(file.getvalue(), np.uint8)

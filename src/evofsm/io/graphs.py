@@ -149,8 +149,8 @@ def to_prism(model: FSMModel, evidence: float = 1.0, least: float = 0.0) -> str:
     // #1, 3 visits
       [a1] s=1 -> // 3 decisions; a1 was used 3 times
         0.333333333333:(s'=0) + // failed 1
-        0.514194120112:(s'=1) + // seen 2 by any action
-        0.152472546555:(s'=2); // seen 1 by any action
+        0.514194120112:(s'=1) + // seen 2
+        0.152472546555:(s'=2); // seen 1
     """
     n = model.n_states
     _PROBABILITY.refuse_others("least", least)
@@ -188,7 +188,7 @@ def _header(model: FSMModel, evidence: float, least: float, unknown: int) -> Ite
     few = is_tried & (model.decisions < evidence)
     share = model.decisions[few].sum() / model.decisions.sum()
     yield f"// A machine of {model.n_states} states and {model.n_actions} actions, by evofsm."
-    yield "// s=0 is failure, s=i the state #i. 'seen 0' is the prior alone, or shared."
+    yield "// s=0 is failure, s=i the state #i. 'seen' is by any action; 0: prior, or shared."
     yield f"// Left out: {(~is_tried).sum():,} pairs of state and action that were never tried, and"
     yield f"// {few.sum():,} that rest on fewer than {evidence:g} decisions ({share:.2%} of all);"
     yield f"// transitions below {least:g}. States without any action, labelled unknown: {unknown}."
@@ -212,8 +212,7 @@ def _command(model: FSMModel, state: int, action: int, least: float) -> Iterator
     chances = np.concatenate([[share], (1.0 - share) * row / row.sum()])
     parts: list[int] = np.rint(chances * 10**_DECIMALS).astype(np.int64).tolist()
     parts[int(np.argmax(parts))] += 10**_DECIMALS - sum(parts)  # to the last digit
-    counts = [f"seen {count:g} by any action" for count in model.changes[state]]
-    comments = [f"failed {failures:.4g}", *counts]
+    comments = [f"failed {failures:.4g}", *(f"seen {count:g}" for count in model.changes[state])]
     usage = f"a{action + 1} was used {model.uses[action]:,.0f} times"
     yield f"  [a{action + 1}] s={state + 1} -> // {decisions:.4g} decisions; {usage}"
     targets = np.flatnonzero(parts).tolist()
