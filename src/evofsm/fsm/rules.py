@@ -179,5 +179,4 @@ def describe_rule(rule: StateRule) -> dict[str, Any]:
 def restore_rule(description: Mapping[str, Any] | None) -> StateRule:
     """The rule that `describe_rule` put into words."""
     settings = dict(description or {})
-    rule: StateRule = rule_named(settings.pop("name", None))(**settings)
-    return rule
+    return cast(StateRule, rule_named(settings.pop("name", None))(**settings))

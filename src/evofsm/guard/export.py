@@ -113,9 +113,8 @@ def write_fmu(guard: Guard, file: Path) -> None:
             for file_name in ("evofsm.h", "evofsm.c", "fmi2.c"):
                 unit.write(folder / file_name, f"sources/{file_name}")
             if (folder / library).exists():
-                unit.write(
-                    folder / library, f"binaries/{sys.platform.removesuffix('32')}64/{library}"
-                )
+                binaries = f"binaries/{sys.platform.removesuffix('32')}64"
+                unit.write(folder / library, f"{binaries}/{library}")
             else:
                 note = "%s holds sources alone: no C compiler built it here (cc, CC)"
                 logging.getLogger(__name__).warning(note, file)

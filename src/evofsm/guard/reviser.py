@@ -268,11 +268,11 @@ class ActionReviser:
                 return Search(options, judgement, best, search.reason)
         except (AttributeError, IndexError, TypeError, ValueError):
             pass  # what it is instead is said
-        raise ValueError(
-            f"{type(self.risk).__name__}.search gave {search!s:.200}; it has to give a Search: "
-            f"the proposal, {wanted}, as the first of its options, the index of one that is "
-            "allowed as best, and as judged a risk in [0, 1], or NaN, of each"
+        text = f"{type(self.risk).__name__}.search gave {search!s:.200}; it has to give a Search:"
+        parts = (
+            "the index of one that is allowed as best, and judged, a risk in [0, 1] or NaN of each"
         )
+        raise ValueError(f"{text} the proposal, {wanted}, as the first of its options, {parts}")
 
     def _refuse_unusable(self, name: str, action: Action) -> None:
         """Raise if what the judge names is not an action, put at the edge of the set or not."""
