@@ -102,9 +102,10 @@ def test_what_is_in_a_log_is_said_with_a_command_that_learns_from_it(evofsm, wri
 
 def test_units_of_names_are_part_of_the_command_that_is_proposed(evofsm):
     rows = (f"{100 * k},{63 + k * k % 19},{k % 70},{k % 3}" for k in range(300))
-    Path("a.csv").write_text("\n".join(["t_ms,ego_kmh,way,acc", *rows, ""]))
+    Path("a.csv").write_text("\n".join(["t_ms,ego_kmh,reset_acc_way,acc", *rows, ""]))
     first = evofsm("learn", "a.csv").stdout
     assert "17.5 to 22.222 m/s, from km/h" in first
+    assert "an action?      acc, by its name" in first  # which reset_acc_way is not
     assert "one every 0.1 s" in first
     learnt = evofsm(*shlex.split(first.replace("\\\n", "").rpartition("  evofsm ")[2]))
     assert (learnt.exit_code, learnt.stderr) == (0, "")

@@ -38,13 +38,19 @@ _TIME = re.compile("(ts?|time|zeit|timestamp|sec|epoch)([^a-z]|$)", re.IGNORECAS
 _FRAME = re.compile("frame([^a-z]|$)", re.IGNORECASE)  # it counts steps of the same length
 # Dates with slashes: the year first, or the day or the month.
 _SLASHES = re.compile(r"(\d{1,4})/\d\d?/(\d\d|\d{4}),? \d\d?:\d\d(:\d\d)?( [AP]M)?$")
-_SET = re.compile("acc|action|valve|ventil|soll|set|^u$|cmd|throttle", re.IGNORECASE)
+_WORDS = re.compile(r"[A-ZÄÖÜ]+(?![a-zäöüß])|[A-ZÄÖÜ]?[^\W\d_A-ZÄÖÜ]+")  # in a name
+# What somebody sets is called so, or has such a word; or one of these, and none of the last.
+_ACTION = re.compile("u|acc(el(eration)?)?", re.IGNORECASE)
+_SET = re.compile("actions?|cmd|commands?|throttle|setpoint|soll.*|.*soll|stell.*", re.IGNORECASE)
+_MAY_SET = re.compile("set|valves?|.*ventil", re.IGNORECASE)
+_MEASURED = re.compile("temp.*|press.*|.*druck|vib.*|rms|curr.*|strom|flow|leak.*|no|nr|id", re.I)
 _FAILURE = re.compile(
-    "st(ö|oe)r|fault|fail|trip|alarm|error|fehler|defek|ausfall|crash|colli|not-?aus|emergency",
+    "st(ö|oe)r|(?<!de)fault|fail|(?<!s)trip|alarm|error|fehler|defek|ausfall|crash|colli|not-?aus"
+    "|emergency",
     re.IGNORECASE,
 )
 _TRUTH = re.compile("true|false|yes|no|ja|nein|wahr|falsch|", re.IGNORECASE)
-_TAG = re.compile("tag|signal|sensor|variable|channel|kanal|param|messstelle|name", re.IGNORECASE)
+_TAG = re.compile("(^|_)tag|signal|sensor|variable|channel|kanal|param|messstelle|name", re.I)
 _WHO = re.compile("ma(sch|ch)ine|device|ger(ä|ae)t|asset|unit|anlage|pump|motor|(^|_)id$", re.I)
 _CODE = re.compile(f"{_FAILURE.pattern}|stat|zustand|code", re.IGNORECASE)
 _LONG = "20ms 50ms 100ms 200ms 500ms 1s 2s 5s 10s 20s 30s 1min 2min 5min 10min 30min 1h 5h 10h 1d"
@@ -162,7 +168,8 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     if one_way and len(one_way) < len(steady):
         facts.append(("left out", f"{', '.join(one_way)}: never comes back, as an odometer"))
         steady = {n: ends for n, ends in steady.items() if n not in one_way}
-    action = next(filter(_SET.search, steady), "")  # else nobody acts
+    if action := next(filter(_is_set, steady), ""):  # else nobody acts
+        facts.append(("an action?", f"{action}, by its name; where nobody sets it: --action ''"))
     nobody = [f"{_named(n, _SIGNS)}=={x:.17g}" for n in steady if n != action for x in stand_ins[n]]
     options += [("--no-leader", " or ".join(nobody))] if nobody else []
     for n in dict.fromkeys((*steady, still)):
@@ -343,6 +350,13 @@ def _round(number: float) -> float:
 def _named(name: str, signs: str) -> str:
     """A column's name as options take it, in double quotes where one of these is in it."""
     return quoted([name]) if set(name) & {*signs, '"'} else name
+
+
+def _is_set(name: str) -> bool:
+    """Whether a column is called as what somebody sets."""
+    words = _WORDS.findall(name)
+    may_be = any(map(_MAY_SET.fullmatch, words)) and not any(map(_MEASURED.fullmatch, words))
+    return bool(_ACTION.fullmatch(name) or any(map(_SET.fullmatch, words)) or may_be)
 
 
 def _stands(z: Floats) -> bool:
