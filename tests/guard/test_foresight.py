@@ -98,6 +98,14 @@ def test_a_warning_of_one_row_is_found_where_the_horizon_is_long():
     assert re.search(r"as well: variable 1 above (6\.[5-9]|7\.[0-5])", judge.told_by_experience)
 
 
+def test_an_alarm_that_is_false_less_often_than_stated_stands_where_there_is_no_other():
+    rng = np.random.default_rng(31)
+    runs = [np.append(rng.normal(size=572), rng.normal(4.0, 1.0, 4)) for _ in range(5)]
+    judge = Foresight.learn_log(runs, [True] * 5, dt=1800.0, horizon=12 * 3600.0)
+    assert {*judge.alarms} == {"0.1, 0.3, 1, 3"}
+    assert judge.of_rate(3)[:, 1:].tolist() == judge.of_rate(0)[:, 1:].tolist() != []
+
+
 def test_one_failure_is_learnt_from_and_of_alarms_the_closest_that_there_is_counts(surge):
     rising = np.linspace(0.0, 1.0, 60)[:, None]
     for runs in ([rising], [rising * 0.5, rising]):
@@ -116,9 +124,7 @@ def test_where_nothing_foresees_a_failure_there_is_no_alarm_and_without_failures
         Foresight.learn_log([[1.0, 2.0]], [False], dt=DT, horizon=HORIZON)
     judge = learnt(random, 40)
     assert judge.alarm is None
-    for_all = (
-        "for 0.1, 0.3, 1, 3 false alarms a day no alarm is false so seldom and better than chance"
-    )
+    for_all = "for 0.1, 0.3, 1, 3 false alarms a day none for so few surely beats chance"
     assert judge.told_by_experience == for_all  # nor does anything hold where it fails
 
 

@@ -286,7 +286,7 @@ class Foresight(LearningJudge):
         holds, shares = judge.forms[:, failure.HELD], there[:, 0] / np.maximum(there[:, 1], 1.0)
         is_known = not there[0, 1] or shares[0] - shares[1] >= _KNOWN
         holds[holds < (_SAID * log.failed.sum() if is_known else np.inf)] = 0.0
-        chance, limits = log.failed.sum() * ahead / len(log.rows), [np.empty((0, 6))]
+        chance, limits = log.failed.sum() * ahead / len(log.rows), list[Floats]()
         score_of, scores = dict[Any, Any](), list[Any]()
         for rate, daily_rate in enumerate(RATES):
             fit = (tallies[..., 2] <= daily_rate * days).all(0) & (tallies[1, ..., 1] > 0)
@@ -294,14 +294,18 @@ class Foresight(LearningJudge):
             best = [np.flatnonzero(leads >= _LONG * leads.max())[-1] for leads in counts[..., 0]]
             parts = [judge.of_rate(int(best[k]), plain=k > 0)[:, 1:] for k in range(2)]
             learnt, plain = counts[[0, 1], best]
-            limits += [np.insert(parts[k], 0, rate, 1) for k in range(2) if fit[k, best[k]]]
+            table = np.vstack([np.empty((0, 5)), *(parts[k] for k in range(2) if fit[k, best[k]])])
             as_many = np.minimum((plain[2] + 1.0) / (worst[0, :, 2] + 1.0), 1.0)
             kind = int(plain[0] >= _BETTER * (as_many * counts[0, :, 0]).max())
             _, right, false = (learnt, plain)[kind]
             low = wilson_bounds(right / (n := right + false), n, _NO_CHANCE)[0] if right else 0.0
             kind = kind if low > chance else _NO_KIND  # no better than an alarm at any time
             score = right, false, float(log.failed.sum()), kind  # one of each limits
-            scores.append(score_of.setdefault((kind, parts[kind % 2].tobytes()), score))
+            score = score_of.setdefault((kind, parts[kind % 2].tobytes()), score)
+            if kind == _NO_KIND and scores and scores[-1][3] != _NO_KIND:  # one for fewer does
+                score, table = scores[-1], limits[-1][:, 1:]
+            scores.append(score)
+            limits.append(np.insert(table, 0, rate, 1))
         tables = judge.forms, np.concatenate(limits), np.array(scores, np.float64)
         return cls(dt, ahead, held, *tables, names, labels.units, days=float(days.min()))
 
@@ -519,7 +523,7 @@ class Foresight(LearningJudge):
         if self.held_out[0, 2] == 1.0:
             return "with one failure nothing can be cross-validated"
         if self.alarm is None:
-            return f"cross-validated, no alarm with at most {RATES[-1]:g} false a day beats chance"
+            return f"cross-validated, none of up to {RATES[-1]:g} false a day surely beats chance"
         fewest = ", as none is for fewer" * (RATES[self.alarm] > self.stated)
         return f"it alarms as for {RATES[self.alarm]:g} false alarms a day{fewest}"
 
@@ -558,11 +562,10 @@ class Foresight(LearningJudge):
         """What the alarm for one of `RATES` is, and how often it was right, in words."""
         right, false, failures, kind = self.held_out[rate].tolist()
         if kind == _NO_KIND:
-            few = "no alarm is false so seldom and better than chance"
-            return self.alarm_in_words if failures == 1.0 else few
+            return self.alarm_in_words if failures == 1.0 else "none for so few surely beats chance"
         plain = "plain thresholds do as well: " * (kind == _PLAIN)
         record = f"{right:.0f} of {failures:.0f} failures foreseen, {false:.0f} false"
-        return f"{plain}{self.words(rate)} ({record}, {_COUNTED})"
+        return f"{plain}{self.words(rate)} ({record}, {_COUNTED}; chosen by it, which flatters)"
 
     def start_episode(self) -> None:
         """Nothing was seen yet; what was before, of an episode that nobody ended, went well."""
