@@ -146,6 +146,8 @@ LOOKED_AT = {
     "ts,machine": (lambda k: f"{1_700_000_000 + k // 3 * 60},{'ABC'[k % 3]}", "each machine, but"),
     "Frame_ID,id": (lambda k: f"{k // 3},{k % 3}", "each id, but mixed"),
     "Date": (lambda k: f"{at(k * 60):%m/%d/%Y %H:%M}", "--unit 'Date=%m/%d/%Y %H:%M'"),
+    "Stamp": (lambda k: f"{at(k * 60):%d-%b-%y %H:%M}".upper(), "--unit 'Stamp=%d-%b-%y %H:%M'"),
+    "Day": (lambda k: f"{45945 + k / 288:.6f}".replace(".", "@"), "--unit Day=d"),
     "Date,Time": (lambda k: f"{at(k):%d/%m/%Y,%H:%M}", "--time Date,Time"),
     "Zeit": (lambda k: f"{at(k):%Y-%m-%d %H:%M:%S}@5", "the clock Zeit"),
     "time": (lambda k: 600 - k, "time runs backwards"),

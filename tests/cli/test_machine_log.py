@@ -168,6 +168,17 @@ def test_a_first_look_says_what_is_odd_in_a_log(evofsm, refused):
     )
     found = evofsm("learn", "late.csv").stdout
     assert ("399, after a row of 9" in found, "--skip-bad" in found) == (True, False)
+    rows = (f"{k % 28 + 1}-Okt-{k // 28 + 10},{'-' if k % 9 == 5 else k % 7}" for k in range(400))
+    Path("okt.csv").write_text("\n".join(["ts,heat", *rows]))
+    found = evofsm("learn", "okt.csv").stdout
+    for part, stands in {
+        "--dt 1": 0,
+        "--skip-bad ": 0,
+        "44 rows, as above": 1,
+        "--time ts ": 1,
+    }.items():
+        assert (part in found) == stands
+    assert "ts, dates that are not read: --unit says" in " ".join(found.split())
     Path("bare.csv").write_text("10.03.2025 06:00:00;6,5;on\n10.03.2025 06:00:10;6,6;on\n")
     assert "is no header" in refused("learn", "bare.csv")
     read = "learn", "odd.csv", "--action", "", "--time", "t"

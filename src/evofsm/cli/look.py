@@ -32,12 +32,12 @@ _COLUMNS_SHOWN = 40  # columns
 _SIGNS = "<>=! "  # what in a name of a condition is ambiguous
 _FAR = 2.0  # far outside is what lies so many ranges of 99 % of the rows beyond them
 _NEAR = 3  # rows before a failure that are never proposed to be left out
-# A larger share of steps, and so many, that are no usual one make no clock.
-_ODD, _MANY = 0.001, 10
+# A larger share of steps, and so many, that are no usual one make no clock; of bad rows no log.
+_ODD, _MANY, _MANY_BAD = 0.001, 10, 0.05
 _TIME = re.compile("(ts?|time|zeit|timestamp|sec|epoch)([^a-z]|$)", re.IGNORECASE)
 _FRAME = re.compile("frame([^a-z]|$)", re.IGNORECASE)  # it counts steps of the same length
-# Dates with slashes: the year first, or the day or the month.
-_SLASHES = re.compile(r"(\d{1,4})/\d\d?/(\d\d|\d{4}),? \d\d?:\d\d(:\d\d)?( [AP]M)?$")
+# Other dates: the year first, or the day or the month, which may be a name.
+_OTHER = re.compile(r"(\d+)([/ -])(\w+)\2(\d{2,4})(,? )\d\d?:\d\d(:\d\d(\.\d+)?)?( [AP]M)?$", re.I)
 _WORDS = re.compile(r"[A-ZÄÖÜ]+(?![a-zäöüß])|[A-ZÄÖÜ]?[^\W\d_A-ZÄÖÜ]+")  # in a name
 # What somebody sets is called so, or has such a word; or one of these, and none of the last.
 _ACTION = re.compile("u|acc(el(eration)?)?", re.IGNORECASE)
@@ -45,8 +45,7 @@ _SET = re.compile("actions?|cmd|commands?|throttle|setpoint|soll.*|.*soll|stell.
 _MAY_SET = re.compile("set|valves?|.*ventil", re.IGNORECASE)
 _MEASURED = re.compile("temp.*|press.*|.*druck|vib.*|rms|curr.*|strom|flow|leak.*|no|nr|id", re.I)
 _FAILURE = re.compile(
-    "st(ö|oe)r|(?<!de)fault|fail|(?<!s)trip|alarm|error|fehler|defek|ausfall|crash|colli|not-?aus"
-    "|emergency",
+    "st(ö|oe)r|(?<!de)fault|fail|trip|alarm|error|fehler|defek|ausfall|crash|colli|not-?aus|emerg",
     re.IGNORECASE,
 )
 _TRUTH = re.compile("true|false|yes|no|ja|nein|wahr|falsch|", re.IGNORECASE)
@@ -133,13 +132,16 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
         asides.append(("time runs", "backwards; turn the rows round first, as below"))
     facts += [*asides, ("rows looked at", f"{len(frame):,}")]
     counts = not clock or _FRAME.match(clock) is not None
-    options = [("--dt", "1")] if counts else [("--time", clock)]
+    options = [("--dt", "1")] if counts and not form else [("--time", clock or form)]
     options += [("--unit", form)] if form and not counts else []
-    bad = max(n_partial, sum(n for n, _ in skips.values()) + sum(odd.values()))
+    bad = sum(n for n, _ in skips.values()) + sum(odd.values())
     if not counts:
         further, n_late = _of_steps(frame[clock].to_numpy()[order], segments, facts, n_partial)
         options, bad = options + further, bad + n_late
-    if bad > SKIPPED:
+    bad = max(bad, n_partial * ("--resample" not in dict(options)))  # there they cost nothing else
+    if bad > max(SKIPPED, _MANY_BAD * len(frame)):
+        facts.append(("to repair", f"{bad:,} rows, as above: too many to be left out (--skip-bad)"))
+    elif bad > SKIPPED:
         options.append(("--skip-bad", f"{_round(2.0 * bad):.0f}"))
     if still:
         options.append(("--where", f"{_named(still, _SIGNS)}>{limit:g}"))
@@ -210,8 +212,8 @@ def _first_rows(
     numbers = [name for name in firsts if name in frame.columns and frame[name].dtype.is_numeric()]
     titles = [names for names in [*zip(texts, strict=True), *pairs] if {*names} <= {*texts}]
     for names in titles if not clock else ():
-        if not clock and (slashes := _dates(frame, names, asides)):
-            dates, (frame, clock, form) = [*names], slashes
+        if not clock and (outcome := _dates(frame, names, asides)):
+            dates, (frame, clock, form) = [*names], outcome
     since = ""
     if not clock:
         clock, unit, since = _clock_of(frame, numbers)
@@ -227,6 +229,10 @@ def _first_rows(
             asides.append(("summer time", f"ends or begins {when:%Y-%m-%d}; time runs on there"))
         frame = frame.with_columns(polars.Series(clock, at + 3600.0 * hours))
     since = ", a number of steps (--dt)" if _FRAME.match(clock) else since
+    if not clock:  # of texts that look like dates --unit says more
+        like_dates = (n for n in texts if "a date?" in explained(firsts[n]))
+        form = next((n for n in like_dates if frame[n].n_unique() > _MOST_TEXTS), "")
+        since = f"{form}, dates that are not read: --unit says how ({form}=%d-%b-%y)" * bool(form)
     asides.insert(0, ("the clock", clock + since or "no column (--dt)"))
     return frame, clock, form
 
@@ -239,9 +245,11 @@ def _clock_of(frame: polars.DataFrame, names: Sequence[str]) -> tuple[str, str, 
         low, high, steps = (z.min(), z.max(), np.diff(z)) if len(z) else (0.0, 0.0, z)
         if low < high and ((steps >= 0).all() or np.median(np.abs(steps)) < 0.1 * (high - low)):
             fit = [unit for unit, n in _EPOCHS.items() if 9e8 * n < low < high < 2.6e9 * n]
-            epochs |= zip([name], fit, strict=False)
+            excel = ["d"] * bool(3.6e4 < low < high < 5.5e4 and 0.0 < np.median(abs(steps)) < 0.05)
+            epochs |= zip([name], fit or excel, strict=False)
     for name in (*filter(_TIME.match, epochs), *epochs):
-        return name, epochs[name], f", {epochs[name]} since 1970"
+        since = {"d": "1899-12-30, as Excel has it"}.get(epochs[name], "1970")
+        return name, epochs[name], f", {epochs[name]} since {since}"
     clock = next((n for like in (_TIME, _FRAME) for n in filter(like.match, names)), "")
     most = float(str(frame[clock].abs().max())) if clock else 0.0
     return clock, next((unit for unit, n in _EPOCHS.items() if most > 1e8 * n), "s"), ""
@@ -250,27 +258,32 @@ def _clock_of(frame: polars.DataFrame, names: Sequence[str]) -> tuple[str, str, 
 def _dates(
     frame: polars.DataFrame, names: Sequence[str], asides: Pairs
 ) -> tuple[polars.DataFrame, str, str] | None:
-    """Rows with dates that are written with slashes, in one column or two; None of others."""
+    """Rows with dates as `_OTHER` has them, in one column or two; None of others."""
     texts = frame[names[0]].str.strip_chars()
     for name in names[1:]:
         texts = texts + " " + frame[name].str.strip_chars()
-    if not (match := _SLASHES.match(str(texts[0]))):
+    if not (match := _OTHER.match(str(texts[0]))):
         return None
-    year = "%Y" if len(match[1] + match[2]) > 4 else "%y"
-    days = ["%Y/%m/%d"] if len(match[1]) == 4 else [f"%d/%m/{year}", f"%m/%d/{year}"]
-    hour = "%I:%M" if match[4] else "%H:%M"
-    hour += f"{':%S' if match[3] else ''}{' %p' if match[4] else ''}"
+    first, sign, second, third, space, has_seconds, has_parts, half = match.groups("")
+    year = "%Y" if len(first + third) > 4 else "%y"
+    month = "%m" if second.isdigit() else "%B" if len(second) > 3 else "%b"
+    days = [("%d", month, year), ("%m", "%d", year)][: 1 + second.isdigit()]
+    days = [("%Y", month, "%d")] if len(first) == 4 else days
+    hour = space + ("%I:%M" if half else "%H:%M")
+    hour += ":%S" * bool(has_seconds) + ".%f" * bool(has_parts) + " %p" * bool(half)
     read = {}
-    for day in days[:: -1 if match[4] else 1]:  # who writes AM and PM has the month first
-        at = texts.str.to_datetime(f"{day} {hour}", strict=False).dt.epoch("us")
+    for day in map(sign.join, days[:: -1 if half else 1]):  # who writes AM has the month first
+        at = texts.str.to_datetime(day + hour.replace(".%f", "%.f"), strict=False).dt.epoch("us")
         read[day] = at.null_count(), int(_odd(np.diff(at.drop_nulls())).sum()), at
     day = min(read, key=lambda day: read[day][:2])
+    if 2 * read[day][0] > len(texts):
+        return None
     if len({faults[:2] for faults in read.values()}) < len(read):
         text = f"day or month first cannot be told of {texts[0]}; it is read as {day} (--unit)"
         asides.append(("the dates", text))
     clock = ",".join(names)
     frame = frame.drop(names).with_columns(read[day][2].cast(polars.Float64).alias(clock))
-    return frame, clock, f"{clock}={day} {hour}"
+    return frame, clock, f"{clock}={day}{hour}"
 
 
 def _odd(steps: Floats) -> NDArray[np.bool_]:

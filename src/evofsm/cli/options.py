@@ -283,7 +283,7 @@ def seconds(name: str, text: str) -> float:
     match = re.fullmatch(r"\s*([0-9.]+)\s*([a-z]*)\s*", text)
     number, unit = match.groups() if match else ("", "")
     with suppress(ValueError, KeyError):
-        return positive(name, float(number)) * (TIMES | {"d": 86400.0})[unit or "s"]
+        return positive(name, float(number)) * TIMES[unit or "s"]
     raise ValueError(f"{name} is {text!r}; write how long, such as 30s, 10min or 1h")
 
 
@@ -335,11 +335,12 @@ def refuse_typed(context: typer.Context, names: Iterable[str], kind: str) -> Non
 
 def units_given(texts: Iterable[str]) -> dict[str, str]:
     """Units by the column, or the beginning of columns, from what --unit was given."""
-    from evofsm.io.tables import UNITS, quoted_name
+    from evofsm.io.tables import UNITS, quoted_name, unit_of
 
     units: dict[str, str] = {}
     for text in texts:
         name, _, unit = ("".join(quoted_name(part.strip())) for part in text.rpartition("="))
+        unit = unit if "%" in unit else unit_of(unit)
         if not (name and (unit in UNITS or "%" in unit)):
             raise ValueError(f"--unit is {text!r}; write NAME=UNIT with one of {', '.join(UNITS)}")
         units[name] = unit

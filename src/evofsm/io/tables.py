@@ -64,7 +64,7 @@ _FOREIGN = {
 _PROFILE = len(_MCAP) + 1 + 8 + 4  # of MCAP, behind the mark, an opcode and two lengths
 
 #: Factors that turn units of time into s, and all units into s, m, m/s or m/s².
-TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0}
 _GROUPS: Mapping[str, Mapping[str, float]] = {
     "s": TIMES,
     "m": {"m": 1.0, "mm": 1e-3, "cm": 0.01, "km": 1000.0, "ft": 0.3048},
@@ -76,6 +76,7 @@ UNITS = {unit: factor for group in _GROUPS.values() for unit, factor in group.it
 #: Of each unit the one that it is turned into.
 SI = {unit: base for base, group in _GROUPS.items() for unit in group}
 _SPELT = {"kmh": "km/h", "kph": "km/h", "kmph": "km/h", "km/hr": "km/h", "mps": "m/s", "sec": "s"}
+_SPELT |= {"day": "d", "days": "d"}
 _SPELT |= {"\u00b5s": "us", "\u03bcs": "us", "knots": "kn", "kt": "kn", "m/s/s": "m/s2"}
 _COMMENT = re.compile(r"\A\s*(#|%|//)+\s*")  # what stands before the last line of a comment
 MISSING = ("", "na", "n/a", "null", "none")  #: what stands in a field where there is no number
@@ -85,8 +86,8 @@ _CONTROL = re.compile(rb"[\0-\x08\x0e-\x1f]")  # what no text holds
 _DATE = re.compile(r"\s*\d{4}-?\d\d-?\d\d[Tt ]")
 # The day first, as only dots tell; whether its year has a century, and whether seconds follow.
 _DAY_FIRST = re.compile(r"\d\d?\.\d\d?\.(?:(\d{4})|\d\d),?[T ]+\d\d?:\d\d(:)?")
-_DATE_LIKE = re.compile(r"\s*\d{1,4}([.:/-])\d\d?\1\d")
-_NO_DATE = 253_402_300_799.0  # from here on no year has four digits [s]
+_DATE_LIKE = re.compile(r"\s*(\d{1,4}|[A-Z][a-z]{2,8})([.:/ -])(\d\d?|[A-Za-z]{3,9})(\2|, )\d")
+_NO_DATE = 3e9  # from here on it is none: days of Excel in seconds, or another unit [s]
 _ISO = "in ISO 8601, such as 2026-03-14T09:26:53.5+01:00, or as 14.03.2026 09:26:53"
 _SAYS_HOW = "; --unit 'COLUMN=%m/%d/%Y %I:%M:%S %p' says how others are written"
 
