@@ -936,8 +936,10 @@ class _Reader:
             rows = np.arange(self._before, self._before + piece.rows)
             return rows * np.float64(self._clock.dt)
         times = np.where(piece.bad, np.nan, piece.numbers[self._columns.time])
-        if not is_date:  # of days as Excel has them, since 1899-12-30
-            return np.where(np.abs(times - 3.9e9) < 8e8, times - 2_209_161_600.0, times)
+        if not is_date:
+            is_excel = np.abs(times - 3.9e9) < 8e8  # days since 1899-12-30
+            tables.SAID_IN["zone"] = " UTC" * (not is_excel.any())
+            return np.where(is_excel, times - 2_209_161_600.0, times)
         if np.isnan(self._first_date):
             self._first_date = times[np.argmin(np.isnan(times))]
             self._noted.began = self._clock.began = float(self._first_date) * _MICROSECOND
