@@ -342,7 +342,7 @@ def test_a_rule_of_one_s_own_is_named_by_its_module_or_as_it_is_registered(
         (["--observe", "hit=0/2"], "column 'hit': '1' is none of the values"),
         (["--action-range", "1:2"], "write LOW:HIGH:WIDTH"),
         (["--action-range", "0:1:1e-9"], "more than 1000 intervals"),
-        (["--horizon", "0"], "greater than or equal to 0.001"),
+        (["--horizon", "4 weeks"], "'--horizon': it is '4 weeks'; write how long"),
         (["--dt", "0"], "--dt is 0.0; it must be a positive"),
         (["--dt", "20", "--guard", "new.evofsm"], "20 s from a decision to the next: too long for"),
         (["--out", "/no/such/folder/model"], "there is no folder"),
@@ -364,7 +364,7 @@ def test_a_rule_of_one_s_own_is_named_by_its_module_or_as_it_is_registered(
         (["--where", "gap>9999", "--resample", "30s"], "and --where gap>9999 must hold"),
         (["--action", "", "--tolerance", "0.1"], "--false-a-day counts"),
         (["--false-a-day", "1"], "--false-a-day is of alarms where nobody"),
-        (["--horizon", "5"], "--horizon is of alarms where nobody"),
+        (["--horizon", "4h"], "--horizon is of alarms where nobody"),
     ],
 )
 def test_wrong_options_end_with_one_line(refused, log, options, message):

@@ -294,7 +294,7 @@ def test_an_alarm_that_came_long_before_counts_once_in_each_horizon(evofsm):
         rows.append(f"{run},{60 * (k + 1000 * run)},{heat},{int(run % 2 and k == 299)}")
     Path("wear.csv").write_text("\n".join(rows))
     asked = "--observe", "heat", "--action", "", "--time", "t", "--failed", "trip"
-    told = evofsm("monitor", "wear.csv", "--summary", *asked, "--horizon", 1200).stdout
+    told = evofsm("monitor", "wear.csv", "--summary", *asked, "--horizon", "20min").stdout
     assert "; one that stays on counts anew each 20 min" in " ".join(told.split())
     assert re.findall(r"^(\d+) .* h  yes, the last of [78] ", told, re.M) == ["6"]
 

@@ -244,23 +244,31 @@ def typed(given: Mapping[str, Any]) -> str:
     return " ".join(f"--{k.replace('_', '-')} {quote(str(v))}" for k, vs in several for v in vs)
 
 
+def duration(text: str) -> float:
+    """How long an option says it is [s], or 0."""
+    try:
+        return 0.0 if text in (0.0, "0") else seconds("it", str(text))
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from None
+
+
 Horizon = Annotated[
     float | None,
     option(
-        "Where nobody acts: an alarm is right if a failure comes within this [s]. "
+        "Where nobody acts: an alarm is right if a failure comes within this [s], or 4h. "
         "[default: 5 % of an episode]",
-        min=1e-3,
+        parser=duration,
     ),
 ]
 Persist = Annotated[
-    float, option("Where nobody acts: how long a limit is passed before it alarms [s].", min=0.0)
+    float,
+    option("Where nobody acts: how long a limit is passed [s], or 5min.", parser=duration),
 ]
 
 FalseADay = Annotated[
     float | None,
     option("Where nobody acts: false alarms a day that are stated. [default: 0.3]", min=0.0),
 ]
-
 
 #: What is said of alarms: --horizon, --persist and --false-a-day.
 Alarms = tuple[float | None, float, float | None]
@@ -269,7 +277,7 @@ Alarms = tuple[float | None, float, float | None]
 def refuse_other_limit(acts: bool, alarms: Alarms, tolerance: float | None) -> None:
     """Raise if what is said of alarms is said of somebody's actions, or the other way round."""
     for name, value in zip(("horizon", "persist", "false-a-day"), alarms, strict=True):
-        if acts and value not in (None, 0.0):
+        if acts and value != {"persist": 0.0}.get(name):
             raise ValueError(f"--{name} is of alarms where nobody acts: --action ''")
     if not acts and tolerance is not None:
         raise ValueError("--tolerance is of actions; where nobody acts, --false-a-day counts")
