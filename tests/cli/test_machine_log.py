@@ -169,7 +169,7 @@ def test_a_first_look_says_what_is_odd_in_a_log(evofsm, refused):
     found = evofsm("learn", "late.csv").stdout
     assert ("399, after a row of 9" in found, "--skip-bad" in found) == (True, False)
     rows = (f"{k % 28 + 1}-Okt-{k // 28 + 10},{'-' if k % 9 == 5 else k % 7}" for k in range(400))
-    Path("okt.csv").write_text("\n".join(["ts,heat", *rows]))
+    Path("okt.csv").write_text("\n".join(["ts,T_in", *rows]))
     found = evofsm("learn", "okt.csv").stdout
     for part, stands in {
         "--dt 1": 0,

@@ -34,7 +34,7 @@ _FAR = 2.0  # far outside is what lies so many ranges of 99 % of the rows beyond
 _NEAR = 3  # rows before a failure that are never proposed to be left out
 # A larger share of steps, and so many, that are no usual one make no clock; of bad rows no log.
 _ODD, _MANY, _MANY_BAD = 0.001, 10, 0.05
-_TIME = re.compile("(ts?|time|zeit|timestamp|sec|epoch)([^a-z]|$)", re.IGNORECASE)
+_TIME = re.compile(r"ts?[\W_]*([mun]?s)?\W*$|(time|zeit|timestamp|sec|epoch)([^a-z]|$)", re.I)
 _FRAME = re.compile("frame([^a-z]|$)", re.IGNORECASE)  # it counts steps of the same length
 # Other dates: the year first, or the day or the month, which may be a name.
 _OTHER = re.compile(r"(\d+)([/ -])(\w+)\2(\d{2,4})(,? )\d\d?:\d\d(:\d\d(\.\d+)?)?( [AP]M)?$", re.I)

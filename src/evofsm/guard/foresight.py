@@ -564,8 +564,8 @@ class Foresight(LearningJudge):
         if kind == _NO_KIND:
             return self.alarm_in_words if failures == 1.0 else "none for so few surely beats chance"
         plain = "plain thresholds do as well: " * (kind == _PLAIN)
-        record = f"{right:.0f} of {failures:.0f} failures foreseen, {false:.0f} false"
-        return f"{plain}{self.words(rate)} ({record}, {_COUNTED}; chosen by it, which flatters)"
+        record = f"{right:.0f} of {failures:.0f} failures foreseen, {false:.0f} false, {_COUNTED}"
+        return f"{plain}{self.words(rate)} ({record}; chosen by this count, which flatters it)"
 
     def start_episode(self) -> None:
         """Nothing was seen yet; what was before, of an episode that nobody ended, went well."""
