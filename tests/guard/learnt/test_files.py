@@ -57,7 +57,7 @@ def with_tolerance(value):
     [
         (with_tolerance(1e9), "tolerance is 1000000000.0"),
         (with_tolerance(-1), "tolerance"),
-        (with_tolerance(None), "float"),
+        (with_tolerance(None), "tolerance is None"),
         ({"judge": lambda array: array[:0]}, "what its LearntRisk has learnt is missing"),
     ],
 )
