@@ -92,14 +92,27 @@ def test_the_summary_says_what_guards_cost(road):
     assert guarded["decisions"] > guarded["limited"] > guarded["revised"] >= 0
 
 
-def test_shadow_changes_nothing(road):
-    alone = drive(road(*NO_GAP), 25.0)
-    sumo = road(*NO_GAP)
-    told = []
-    guards = attach(sumo, ["ego"], mode="shadow", report=told.append)
-    assert drive(sumo, 25.0) == alone
-    assert guards.guarding.revised > 0
-    assert [each.collider for each in guards.collisions] == ["ego"]
+USUAL = (
+    '<vTypeDistribution id="mix"><vType id="usual" speedDev="0.1" probability="0.7"/>'
+    '<vType id="truck" vClass="truck" probability="0.15"/>'
+    '<vType id="bike" vClass="motorcycle" probability="0.15"/></vTypeDistribution>'
+    '<flow id="car" type="mix" route="along" '
+    'begin="1" end="40" period="2" departSpeed="max" departPos="0"/>'
+)
+
+
+@pytest.mark.parametrize("mode", ["watch", "shadow"])
+def test_who_only_looks_changes_nothing(road, mode):
+    def cars(sumo):
+        return [(car, sumo.vehicle.getSpeed(car)) for car in sumo.vehicle.getIDList()]
+
+    others = USUAL.replace("max", "random")  # of SUMO's own numbers
+    alone = drive(sumo := road(*NO_GAP, others=others), 25.0), cars(sumo)
+    sumo, told = road(*NO_GAP, others=others), []
+    guards = attach(sumo, ["ego"], mode=mode, report=told.append)
+    assert (drive(sumo, 25.0), cars(sumo)) == alone
+    assert (mode == "watch") == (guards.guarding is None or guards.guarding.revised == 0)
+    assert [each.collider for each in guards.collisions if each.collider == "ego"] == ["ego"]
     np.testing.assert_allclose([one.wish for one in told], [one.deed for one in told], atol=1e-9)
 
 
@@ -112,16 +125,9 @@ def test_shadow_changes_nothing(road):
     ],
 )
 def test_where_drivers_keep_their_distance_guards_do_no_harm(road, step, options):
-    usual = (
-        '<vTypeDistribution id="mix"><vType id="usual" speedDev="0.1" probability="0.7"/>'
-        '<vType id="truck" vClass="truck" probability="0.15"/>'
-        '<vType id="bike" vClass="motorcycle" probability="0.15"/></vTypeDistribution>'
-        '<flow id="car" type="mix" route="along" '
-        'begin="1" end="40" period="2" departSpeed="max" departPos="0"/>'
-    )
     found = []
     for mode in ("watch", "act"):
-        sumo = road(others=usual)
+        sumo = road(others=USUAL)
         sumo.load([*road.options[:-1], str(step), "--seed", "1", *options])
         sumo.simulationStep()
         sumo.vehicle.setType("ego", "usual")  # nobody is hasty

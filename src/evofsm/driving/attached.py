@@ -98,7 +98,6 @@ class Seeing:
 
     def __init__(self, sumo: Any) -> None:
         self._vehicle, self._simulation = sumo.vehicle, sumo.simulation
-        self._kinds = sumo.vehicletype
         self._bodies: dict[str, _Facts] = {}
         self.look_up()
 
@@ -118,16 +117,15 @@ class Seeing:
         # slower one further; whoever comes to a standstill amid a step gets further, too, by up to
         # an eighth of its braking over the square of the step (`_further`).
         self._euler = 0.0 if ballistic else self.dt
-        self._known: set[str] = set()
         self._bodies.clear()
 
-    def look_at_kinds(self) -> None:
-        """With an actionStepLength in any type SUMO steps ballistically, and no option says so."""
-        if self._euler and self._kinds.getIDCount() != len(self._known):
-            new = set(self._kinds.getIDList()) - self._known
-            self._known |= new
-            if any(self._kinds.getActionStepLength(kind) > self.dt + _TICK for kind in new):
-                self._euler = 0.0
+    def meet(self, car: str) -> None:
+        """With an actionStepLength in any type SUMO steps ballistically, and no option says so.
+
+        Cars are asked, no types: one may be a distribution, of which SUMO would draw.
+        """
+        if self._vehicle.getActionStepLength(car) > self.dt + _TICK:
+            self._euler = 0.0
 
     def forget(self, car: str) -> None:
         """It has left."""
@@ -634,7 +632,6 @@ class Attachment:
                 warnings.warn(_SKIPPED, RuntimeWarning, stacklevel=2)
             self._begin_anew()
         self._now = now
-        self._seeing.look_at_kinds()
         self._count_cars()
         for collision in self._sumo.simulation.getCollisions():
             pair = collision.collider, collision.victim
@@ -701,6 +698,7 @@ class Attachment:
             self._cars.cars.pop(car, None)
             self._seeing.forget(car)
         for car in sorted(here - (self._known - jumps)):
+            self._seeing.meet(car)
             if self._chosen(self._sumo, car):
                 self._cars.add(car)
                 self.ever.add(car)
