@@ -187,20 +187,24 @@ def test_a_car_is_taken_over_only_where_it_has_to_be_and_handed_back(road):
     assert guards.guarding.decisions == decisions
 
 
-def test_stops_and_limits_stay_the_drivers(road):
+@pytest.mark.parametrize("parking", [0, 1])
+def test_stops_and_limits_stay_the_drivers(road, parking):
     stop = (
         '<vehicle id="third" type="hasty" route="along" depart="0" departPos="10">'
-        '<stop lane="road_0" endPos="300" duration="5"/></vehicle>'
+        f'<stop lane="road_0" endPos="300" duration="5" parking="{parking}"/></vehicle>'
     )
     sumo = road(*NO_GAP, others=stop)
-    attach(sumo, "all")
-    stood = False
+    guards, here, stood = attach(sumo, "all"), 0, 0
     for _ in range(600):
         drive(sumo, 0.1, brakes_at=np.inf)
-        stood |= sumo.vehicle.getStopState("third") == 1
+        here += sumo.vehicle.getIDCount()
+        stood += sumo.vehicle.isStopped("third")
         for car in sumo.vehicle.getIDList():
-            assert sumo.vehicle.getSpeed(car) <= sumo.vehicle.getAllowedSpeed(car) + 1e-6
-    assert stood
+            allowed = max(0.0, sumo.vehicle.getAllowedSpeed(car))  # below 0 where it parks
+            assert sumo.vehicle.getSpeed(car) <= allowed + 1e-6
+    assert stood > 0
+    assert guards.guarding.overruled == 0
+    assert guards.summary()["car_seconds"] == pytest.approx(0.1 * (here - stood))
 
 
 REACTS = measures.ResponsibilitySensitiveSafety(0.1, 3.5, 4.5, 9.0)
@@ -428,7 +432,7 @@ def test_all_some_those_of_a_type_or_a_share_which_is_the_same_in_every_run():
         assert half == pytest.approx(500, abs=50)  # three standard deviations
 
 
-@pytest.mark.parametrize("vehicles", ["none", "x%", "120%", 0.0, -0.1, 1.5, float("nan")])
+@pytest.mark.parametrize("vehicles", ["none", "x%", "120%", "1", 0.0, -0.1, 1.5, float("nan")])
 def test_anything_else_is_refused(vehicles):
     with pytest.raises(ValueError, match="vehicles is"):
         choose(vehicles)

@@ -374,6 +374,8 @@ class Guarding:
         if speed > limit + _DIFFERS:
             car.script = math.inf
         elif speed < min(limit, self._vehicle.getSpeedWithoutTraCI(car.id)) - _DIFFERS:
+            if self._vehicle.isStopped(car.id):  # at its stop
+                return False
             car.script = speed
         elif not speed <= car.script + _DIFFERS:
             car.script = math.nan
@@ -485,7 +487,7 @@ def choose(vehicles: str | float | Iterable[str]) -> Callable[[Any, str], bool]:
             share = float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
         except ValueError:
             share = math.nan
-        if not 0.0 < share <= 1.0:
+        if not 0.0 < share <= 1.0 or vehicles == "1":  # which is an id
             raise ValueError(
                 f"vehicles is {vehicles!r}; it is 'all', 'type:NAME', a share above 0 up to 1, "
                 "such as 0.1 or '10%', or a list of ids"
@@ -539,6 +541,8 @@ class _Ride:
         """Take in a step of cars that are here; others are forgotten."""
         before, self.latest, dt = self.latest, {}, self.dt
         for car in cars:
+            if vehicle.isStopped(car):
+                continue
             speed, free = vehicle.getSpeed(car), vehicle.getAllowedSpeed(car)
             self.seconds += dt
             self.metres += speed * dt
@@ -553,7 +557,7 @@ class _Ride:
 class Collision(NamedTuple):
     """A collision, told once for the two."""
 
-    time: float  #: [s]
+    time: float  #: at which the step began, as SUMO writes it [s]
     collider: str  #: of two in a lane the one behind
     victim: str
     kind: str  #: as SUMO calls it
@@ -636,7 +640,7 @@ class Attachment:
         for collision in self._sumo.simulation.getCollisions():
             pair = collision.collider, collision.victim
             if now - self._met.get(pair, -math.inf) > _SAME_COLLISION:
-                self.collisions.append(Collision(now, *pair, collision.type))
+                self.collisions.append(Collision(now - self._seeing.dt, *pair, collision.type))
             self._met[pair] = now
         self.looked += len(self._cars.cars)
         self._ride.see(self._cars.cars, self._sumo.vehicle)
@@ -647,10 +651,11 @@ class Attachment:
     def summary(self) -> dict[str, float]:
         """What came of the cars that are, or were, guarded or watched; numbers by name.
 
-        ``cars``; ``car_seconds`` that they drove, in all; ``collisions`` of all cars,
-        ``of_guarded`` those in which one of them ran into another, ``into_guarded`` those in which
-        another ran into one of them; mean ``speed`` [m/s]; ``hard_brakes``, each harder than 5 m/s²
-        and counted once; RMS ``jerk`` [m/s³]; ``time_lost`` against driving on a free road [s].
+        ``cars``; ``car_seconds`` that they drove, without stops and parking; ``collisions`` of all
+        cars (two that touch again within 5 s have one), ``of_guarded`` those in which one of them
+        ran into another, ``into_guarded`` those in which another ran into one of them; mean
+        ``speed`` [m/s]; ``hard_brakes``, each harder than 5 m/s² and counted once; RMS ``jerk``
+        [m/s³]; ``time_lost`` against driving on a free road [s].
         Where guards decided, ``decisions``, ``limited`` (steps with a limit to the speed),
         ``revised`` (those that changed what the driver wanted, `Guarding.revised`), and
         ``microseconds`` for each decision, all that guarding takes.
