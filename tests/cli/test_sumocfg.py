@@ -50,9 +50,15 @@ def test_guards_act_where_they_are_told_to(evofsm, configuration):
     assert found["act"]["speed"] > 0.9 * found["shadow"]["speed"]
     assert found["act"]["alone"]["collisions"] == found["shadow"]["collisions"]
     assert found["shadow"]["revised"] > 0
+    configuration = configuration.rename(configuration.with_name("my.sumo.cfg"))
     some = evofsm("drive", configuration, "--vehicles", "ego,eg")
     assert re.search(r"collisions +[1-9] +0\n", some.stdout)
     assert some.stderr.endswith("never came: eg\n")
+    written = '<random value="true"/><statistic-output value="of.xml"/></configuration>'
+    configuration.write_text(CONFIGURATION.replace("</configuration>", written))
+    assert "draw other numbers" in evofsm("drive", configuration, "--vehicles", "ego").stderr
+    assert (configuration.parent / "alone.of.xml").exists()
+    assert (configuration.parent / "of.xml").exists()
 
 
 @pytest.mark.parametrize(
@@ -62,7 +68,7 @@ def test_guards_act_where_they_are_told_to(evofsm, configuration):
         (["--vehicles", "lots%"], "vehicles is"),
         (["--seed", "0", "--reviser", "none"], "--reviser, --seed: only for families"),
         (["--vehicles", "type:hatsy"], "types are calm, hasty, ids ego, lead"),
-        (["--vehicles", "eg"], "nothing was guarded"),
+        (["--vehicles", "1"], "nothing was guarded"),  # an id, no share
         (["--vehicles", "0.1%"], "it takes none of 2 cars in 80 s"),
     ],
 )

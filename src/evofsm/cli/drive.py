@@ -86,11 +86,13 @@ def drive(
 
     A SUMO configuration (my.sumocfg) is run as it is, with guards in the cars that --vehicles names
     and, to act, alone before; of all else only --mode (act or shadow), --tolerance and --json hold.
+    What the one alone writes is called alone.NAME. Two cars that touch again within 5 s have one
+    collision; stops and parking are no time lost.
     """
     from evofsm.cli import driving
     from evofsm.cli.show import facts, print_json, progress, say, show, warn
 
-    if family.endswith(".sumocfg"):
+    if family.endswith((".sumocfg", ".sumo.cfg")):
         common = {"family", "vehicles", "mode", "tolerance", "as_json"}
         options.refuse_typed(ctx, sorted(ctx.params.keys() - common), "families of scenarios")
         driving.run_configuration(Path(family), vehicles, mode, tolerance, as_json=as_json)

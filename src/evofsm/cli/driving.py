@@ -324,11 +324,14 @@ def run_configuration(
     """Run it to its end, or until all cars have arrived, and print `Attachment.summary` of it."""
     if mode not in ("act", "shadow"):
         raise ValueError(f"--mode is {mode!r}; for a configuration it is act or shadow")
-    by_ids = not re.match(r"all$|type:|[0-9.]+$|.*%$", vehicles)
+    by_ids = not re.match(r"all$|type:|[0-9]*\.[0-9]*$|.*%$", vehicles)
     choice = split_names(vehicles) if by_ids else vehicles
 
     def driven(how: str) -> dict[str, Any]:
-        with progress("Driving") as move, _running(file) as (sumo, steps):
+        prefix = ("--output-prefix", "alone.") if how == "watch" else ()
+        with progress("Driving") as move, _running(file, *prefix) as (sumo, steps):
+            if prefix and str(sumo.simulation.getOption("random")).lower() in ("true", "1"):
+                warn("--random: alone and guarded draw other numbers; name a seed to compare them")
             cars = driving.attach(sumo, choice, mode=how, tolerance=tolerance)
             begin, kinds = float(sumo.simulation.getTime()), dict[str, str]()
             for seconds in steps:

@@ -74,7 +74,7 @@ def watch(
             log_guard = None if guard is None else Guard.load(guard)
             try:
                 log_format = options.reading_of(**{**options.read_with(guard), **reading})
-                is_simulation = what.endswith(".sumocfg")
+                is_simulation = what.endswith((".sumocfg", ".sumo.cfg"))
                 show = session.watched_simulation if is_simulation else session.watched_log
                 run = show(what, log_format, risk, case, log_guard, brakes=brakes)
             except ValueError as error:
