@@ -167,6 +167,8 @@ def test_who_is_behind_and_cannot_be_spared_is_braked_for_softly_unless_it_is_su
     assert "the softest for ahead" in revision.reason
     me, others = Object("me", 0.0, 0.0, 0.0), [ahead(0.3, 0.0), behind(1.0, 5.0)]
     assert -0.1 < decide(Scene(me, others).rows(most=2)).executed <= 0.0  # who stands stays
+    creeping = Scene(me._replace(vx=0.18), [ahead(0.03, 0.0), behind(0.1, 0.3)])
+    assert decide(creeping.rows(most=2)).executed < -0.5 * 0.18**2 / 0.03  # and who creeps stops
 
 
 def test_who_stands_and_goes_on_standing_is_not_changed():

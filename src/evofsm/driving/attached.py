@@ -65,7 +65,7 @@ _SAME_COLLISION = 5.0
 _LOOKS_AHEAD, _GENTLE = 30.0, 3.0
 _CAR_WIDTH = 1.8
 # Nobody is nearer in what is judged [m]. SUMO keeps minGap itself: what is kept beside it [m].
-_NEAREST, _MARGIN = 0.05, 0.1
+_NEAREST, _MARGIN = 0.01, 0.1
 # Limits are as coarse as that [m/s²], and so far a driver may want more.
 _COARSE = 0.3
 # Slower than this a car stands, and a speed that differs by no more is the same [m/s].

@@ -20,7 +20,7 @@ from evofsm.fsm.validation import Floats
 HARDEST = 15.0
 
 # Cars that touch, or overlap in what a sensor says, are taken to be so far apart [m].
-_TOUCHING = 0.1
+_TOUCHING = 0.01
 # Halvings of [0, HARDEST] in search of the critical deceleration: to 0.015 m/s².
 _HALVINGS = 10
 
