@@ -161,6 +161,15 @@ def test_a_guarded_car_does_not_collide(road, options, ballistic):
         assert stands or one.deed <= one.revision.executed + 1e-6
 
 
+@pytest.mark.parametrize(("mode", "vehicles"), [("act", "all"), ("act", "1%"), ("shadow", "all")])
+def test_of_a_car_in_which_a_guard_acts_nothing_is_learnt(road, mode, vehicles):
+    guards = attach(sumo := road(*NO_GAP), ["ego"])
+    attach(sumo, vehicles, mode=mode)
+    drive(sumo, 25.0)
+    learnt = sum(len(brakes) for brakes in guards.guarding.leaders.values())
+    assert learnt == ((mode, vehicles) != ("act", "all"))
+
+
 def test_where_sumo_says_0_of_whatever_is_nearer_than_min_gap_the_car_stops(road):
     sumo = road(*NO_GAP)
     guards = attach(sumo, ["ego"])

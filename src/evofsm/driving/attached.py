@@ -427,13 +427,13 @@ class Guarding:
     def _watch(self, speeds: dict[str, float]) -> None:
         """Learn how hard leaders brake, each by itself, whoever follows it.
 
-        What a guard makes a car do, whoever attached it, is not what leaders do: it is not learnt.
+        Not of cars in which guards act, whoever attached them: what a guard makes a car do is not
+        what leaders do, and of what such a car does by itself the gentle part would be left out.
         """
         groups = [a.guarding for a in _ATTACHED if a._sumo is self._sumo and a.guarding]
-        for car in chain.from_iterable(group.cars.values() for group in groups):
-            if car.mode is not None:
-                speeds.pop(car.id, None)
-                self._watches.pop(car.id, None)
+        for car in chain.from_iterable(group.cars for group in groups if group._acts):
+            speeds.pop(car, None)
+            self._watches.pop(car, None)
         for leader, speed in speeds.items():
             if leader not in self._watches:
                 self._watches[leader] = BrakeWatch(self.interval), self._leaders_like(leader)
@@ -619,6 +619,7 @@ class Attachment:
         if self._listener is not None:
             self._sumo.removeStepListener(self._listener)
             self._listener = None
+            _ATTACHED.discard(self)
 
     def step(self) -> bool:
         """Take in a step of the simulation that is over, and decide on the next.
