@@ -77,9 +77,11 @@ def test_a_key_that_is_there_twice_is_named():
 
 
 def test_the_time_of_what_is_refused_is_told_where_it_can_be_read():
-    for wrong, time in ((line(gap="near"), 1.0), (line(time="noon"), None), (scene(3), 2.0)):
+    wrongs = (line(gap="near"), 1.0), (line(time="noon"), None), (scene(3), 2.0)
+    in_ms = Form(guard_for_cars(-6.0, 2.5), unit="ms"), line(time=1500, gap="near"), 1.5
+    for form, wrong, time in (*((FORM, *wrong) for wrong in wrongs), in_ms):
         with pytest.raises(MessageError) as error:
-            FORM.read(wrong)
+            form.read(wrong)
         assert error.value.time == time
 
 

@@ -7,6 +7,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from operator import itemgetter
 from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
@@ -143,7 +144,8 @@ class Form:
             if (beyond := self._guard.beyond(observation)) is not None:
                 raise MessageError(*beyond)
         except MessageError as error:
-            error.time = _time(body)
+            with suppress(MessageError, TypeError, OverflowError):  # where it can be read
+                error.time = self._when(body, in_si=body is line)
             raise
         return message
 
@@ -326,13 +328,6 @@ def _refuse_twice(pairs: list[tuple[str, Any]]) -> None:
     if len(dict(pairs)) < len(pairs):
         name, count = Counter(name for name, _ in pairs).most_common(1)[0]
         raise MessageError(name[:_LETTERS], f"is there {count} times; which of them counts?")
-
-
-def _time(told: dict[str, Any]) -> float | None:
-    """The time of a message, where it can be read."""
-    time = told.get("time")
-    is_time = type(time) in (int, float) and abs(time) <= LARGEST_OBSERVATION  # type: ignore[arg-type]
-    return float(time) if is_time else None  # type: ignore[arg-type]
 
 
 def _at(told: Any, place: str) -> Any:
