@@ -256,6 +256,18 @@ def test_local_time_of_irregular_rows_runs_on_where_summer_time_changes(evofsm, 
     (line,) = told.stderr.splitlines()
     assert "summer time ends or begins; hours run on there" in line
     assert "time jumps" not in told.stdout
+    begun = *asked, "--interval", 5, "--hole", "1min"
+    live = [json.loads(x) for x in evofsm("monitor", "night.csv", *begun).stdout.splitlines()]
+    assert not any("a new episode" in answer.get("note", "") for answer in live)
+    hours, ran = live[-1]["hours"], live[-1]["time"] - live[1]["time"]
+    assert (hours, ran // 3600) == ((1, 1) if month == 10 else (-1, 3))
+    zoned = f"{local:%Y-%m-%dT%H:%M:%S}+01:00;4;0"
+    Path("night.csv").write_text(
+        "\n".join(["Zeit;heat;trip", *rows[:2], zoned, '{"end": true}', zoned])
+    )
+    *_, other, _, again = evofsm("monitor", "night.csv", *begun).stdout.splitlines()
+    assert "line 4: is no local time, unlike that of the row before; all have" in other
+    assert '"kind":"decision"' in again
 
 
 def test_failures_right_after_a_hole_are_counted_wherever_others_are(evofsm):
@@ -310,7 +322,7 @@ def test_live_rows_stand_as_in_the_log_and_what_cannot_be_compared_is_refused(ev
         return [json.loads(line) for line in told.stdout.splitlines()]
 
     usual = {"heat": 6, "trip": 0, "runs": "yes"}
-    dates = "10.03.2025 06:00:00", "10.03.2025, 6:01:00,0", "2025-03-10T07:02:00+01:00"
+    dates = "10.03.2025 06:00:00", "10.03.2025, 6:01:00,0", "2025-03-10T06:02:00"
     trips = [f"2025-03-10 06:{k:02}:00" for k in range(3, 9)]
     came = answers(
         *({"Zeit": date, **usual} for date in dates),

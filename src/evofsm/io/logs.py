@@ -50,8 +50,8 @@ _FASTEST, _LONGEST_USUAL = 60.0, 5.0
 _COMPARED, _CORRELATED = 50, 0.9
 _SPEED = re.compile(r"v([_0-9]|$)|.*(speed|velocity)", re.IGNORECASE)
 _MICROSECOND = 1e-6
-# A date with a zone; months in which clocks are put on or back.
-_ZONE, _CHANGES = re.compile(r"(Z|UTC|[+-]\d\d:?\d\d)$"), (3, 4, 9, 10, 11)
+#: A date with a zone; months in which clocks are put on or back.
+ZONE, _CHANGES = re.compile(r"(Z|UTC|[+-]\d\d:?\d\d)$"), (3, 4, 9, 10, 11)
 _NO_CAR = "{!r} cannot be right (another unit? --unit; a stand-in for nobody? --no-leader); in SI "
 
 # What may be done about a number that is missing.
@@ -475,7 +475,7 @@ def hours_unsaid(times: Floats, sample: str, before: float = 0.0) -> Floats:
     steps, hours = np.diff(times), np.zeros(len(times))
     usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else math.nan
     odd = np.flatnonzero(are_unusual(steps, usual))
-    for hour in (1, -1) if not _ZONE.search(sample) else ():
+    for hour in (1, -1) if not ZONE.search(sample) else ():
         later = steps[odd] + 3600.0 * hour  # of irregular rows a longer step
         is_near = (later >= 0.0) & (later < (1800.0 if hour > 0 else min(12.0 * usual, 1800.0)))
         for row in odd[is_near | ~are_unusual(later, usual)] + 1:

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from evofsm.cli.foreseen import guard_of_alarms
@@ -29,7 +30,7 @@ from evofsm.fsm.validation import probability
 from evofsm.guard import ActionReviser, BoxActions, Choices, Foresight, Guard, LearntRisk, Mode
 from evofsm.guard.api import Proposal, Revision
 from evofsm.guard.reviser import is_spoken, make_usable
-from evofsm.io.logs import Condition
+from evofsm.io.logs import Condition, hours_unsaid
 from evofsm.io.tables import date
 
 _log = logging.getLogger(__name__)
@@ -95,7 +96,7 @@ class Decider:
         try:
             if (body := self.csv.read(line)) is None:
                 return self._of("waiting", alarm=self._alarm, reason=messages.NO_ROW)
-            message = self.form.read(body)
+            message = self._running(self.form.read(body))
             self._next = self._sent_before(message)
             if self._next is not None:
                 return self._recent[self._next][1]
@@ -120,6 +121,20 @@ class Decider:
             return self.act(told)
         finally:
             self.keep(None)
+
+    def _running(self, told: Message) -> Message:
+        """A message by a clock that runs on as in logs, where summer time ends or begins."""
+        messages = [message for message, _ in self._recent]
+        rows = [m for m in messages if isinstance(m, Row) and m.hours is not None]
+        if told.hours is None or told.time is None or not rows:
+            return told
+        times, hours = [row.clock for row in rows], [row.hours or 0.0 for row in rows]
+        *_, before, unsaid = hours_unsaid(np.array([*times, time := told.time]), "")
+        ways = [*{*hours}, hours[-1] + float(unsaid - before)]
+        candidates = [structs.replace(told, time=time + 3600.0 * h, hours=h) for h in ways]
+        return next(
+            (m for m in candidates if m in messages), candidates[-1]
+        )  # sent again, as it was
 
     def _sent_before(self, told: Message) -> int | None:
         """Where among the recent messages one is that is sent again; None if it is a new one.
@@ -163,20 +178,27 @@ class Decider:
         latest = self.latest
         if self.slots.change(row, latest):
             return
+        when = row.clock
+        if isinstance(latest, Row) and (row.hours is None) != (latest.hours is None):
+            text = f"is {'no ' * (row.hours is None)}local time, unlike that of the row before"
+            text += "; all have a zone, or none (an end between begins anew)"
+            raise MessageError("time", text, when)
         if isinstance(latest, Row) and latest.time - _LATE <= row.time <= latest.time:
-            text = f"comes after {date(latest.time, ' s')}: late rows are left out"
+            text = f"comes after {date(latest.clock, ' s')}: late rows are left out"
             text = text if row.time < latest.time else "was decided on before, with other values"
-            raise MessageError("time", f"{date(row.time, ' s')} {text}", row.time)
+            raise MessageError("time", f"{date(when, ' s')} {text}", when)
         if self.slots.is_over(row):
             text = f"comes after its {self.slots.step:g} s were decided on, as nothing came"
-            raise MessageError("time", text, row.time)
+            raise MessageError("time", text, when)
 
     def error(self, about: str, what: str, time: float | None = None) -> Answer:
         """What is answered where a message is refused."""
         return self._of("error", time=time, about=about, error=what)
 
-    def _of(self, kind: str, **said: Any) -> Answer:
-        return {"schema": messages.SCHEMA, "kind": kind, "n": self.n, **said}
+    def _of(self, kind: str, row: Row | None = None, **said: Any) -> Answer:
+        when = {} if row is None else {"time": row.clock}
+        when |= {"hours": row.hours} if row and row.hours else {}
+        return {"schema": messages.SCHEMA, "kind": kind, "n": self.n, **when, **said}
 
     def act(self, told: Taken) -> Answer:
         """Take in what was accepted, and answer it."""
@@ -235,7 +257,7 @@ class Decider:
         if not (self.rows or self.slots.waiting) or self._left_out(told):
             return ""
         if step < 0.0:
-            return f"time went back from {date(latest.time, ' s')}"
+            return f"time went back from {date(latest.clock, ' s')}"
         if told.observation and told.ahead != latest.ahead:
             return "another one is ahead"
         if hole is not None and step > max(hole, HOLE * self.guard.interval):
@@ -260,7 +282,7 @@ class Decider:
             whole = slots.add(row) if slots.step else row
             if whole is not None:
                 return self._decided(whole)
-            return self._of("waiting", time=row.time, alarm=self._alarm)
+            return self._of("waiting", row, alarm=self._alarm)
         is_new = fails and not slots.fails(self._before(row))
         if is_new:
             slots.leave_out(row)
@@ -271,7 +293,7 @@ class Decider:
         why = f"--failed {slots.columns.failed}" if fails else why
         action = {"reason": why} if self._is_alone else self._unjudged(row, why)
         verdict = {"failed": is_new} if is_end else {"alarm": False}
-        return self._of("end" if is_end else "waiting", time=row.time, **verdict, **action, **last)
+        return self._of("end" if is_end else "waiting", row, **verdict, **action, **last)
 
     def _left_out(self, row: Row) -> str:
         """Why a row does not count: nobody is ahead, --no-leader or --where says so; or nothing."""
@@ -303,12 +325,12 @@ class Decider:
                 if "failed" not in self._said:  # once, as it may fail at each row
                     _log.exception("the guard failed at %s s", row.time)
                 self._said.add("failed")
-                return self.error("guard", f"failed: {type(error).__name__}: {error}", row.time)
+                return self.error("guard", f"failed: {type(error).__name__}: {error}", row.clock)
             self.rows += 1
             self._alarm = self._is_alarm(revision)
             body = self._revised(row, revision)
         on = {"alarm": self._alarm, "mode": self._mode.value}
-        return self._of("decision", time=row.time, **body, **on, **note)
+        return self._of("decision", row, **body, **on, **note)
 
     def _revised(self, row: Row, revision: Revision) -> Answer:
         """What was decided on a row, and in a scene whom about."""

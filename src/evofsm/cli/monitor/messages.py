@@ -20,6 +20,7 @@ from evofsm.driving.naming import REVERSE, SPEEDS, VARIABLES
 from evofsm.driving.traffic import PLACES, RATES, SIZES
 from evofsm.fsm.naming import visible
 from evofsm.guard import ActionReviser, BoxActions, Choices, Guard
+from evofsm.io.logs import ZONE
 from evofsm.io.tables import TIMES, is_number, seconds_of_date
 from evofsm.store import LARGEST_OBSERVATION
 
@@ -61,6 +62,13 @@ class Row(msgspec.Struct, frozen=True, tag="row"):
     ahead: str | int | None = None  #: id of the object that is followed, in a scene
     objects: tuple[str, ...] = ()  #: ids of all objects, where all are judged: number 1 first
     told: dict[str, Any] = {}  #: what other keys say, None where they are not there
+    #: By which a clock of dates without a zone was put back, and the time runs on; else None.
+    hours: float | None = None
+
+    @property
+    def clock(self) -> float:
+        """What its clock showed [s]."""
+        return self.time - 3600.0 * (self.hours or 0.0)
 
 
 class End(msgspec.Struct, frozen=True, tag="end"):
@@ -69,6 +77,7 @@ class End(msgspec.Struct, frozen=True, tag="end"):
     failed: bool
     observation: tuple[float | None, ...] | None = None  #: the last one; nothing was decided on it
     time: float | None = None  #: [s]
+    hours: float | None = None  #: as of a row
 
 
 class Pause(msgspec.Struct, frozen=True, tag="pause"):
@@ -145,7 +154,7 @@ class Form:
                 raise MessageError(*beyond)
         except MessageError as error:
             with suppress(MessageError, TypeError, OverflowError):  # where it can be read
-                error.time = self._when(body, in_si=body is line)
+                error.time = self._when(body, in_si=body is line)[0]
             raise
         return message
 
@@ -161,9 +170,9 @@ class Form:
             fields = msgspec.convert({keys[name]: body[name] for name in body}, kind)
         except msgspec.ValidationError as error:
             raise _refused(body, str(error)) from None
-        time = self._when(fields, in_si=in_si)
+        time, hours = self._when(fields, in_si=in_si)
         if kind is self._end:
-            return self._of_end(fields, time)
+            return self._of_end(fields, time, hours)
         if time is None:
             clocks = "".join(f", or {name!r}" for name in self._clocks if name != "time")
             raise MessageError("time", f"is missing{clocks}; every message of its kind has it")
@@ -171,33 +180,34 @@ class Form:
         if kind is self._scene:
             return self._of_scene(fields["ego"], fields["objects"], time, proposal)
         also = {name: fields.get(name) for name in self._others}
-        return Row(time, self._seen(fields), proposal, told=also)
+        return Row(time, self._seen(fields), proposal, told=also, hours=hours)
 
-    def _when(self, told: dict[str, Any], *, in_si: bool) -> float | None:
-        """The time of a message [s], as it or a log has it."""
+    def _when(self, told: dict[str, Any], *, in_si: bool) -> tuple[float | None, float | None]:
+        """The time of a message [s], as it or a log has it; and 0 hours, if it has no zone."""
         times = {name: told[name] for name in self._clocks if told.get(name) is not None}
         name, time = next(iter(times.items()), ("time", None))
         if isinstance(time, str):
+            text = " ".join(map(str, times.values())).strip()
             try:
-                return seconds_of_date(" ".join(map(str, times.values())), self._form)
+                return seconds_of_date(text, self._form), None if ZONE.search(text) else 0.0
             except ValueError:
                 fault = f"is {_shown(time)}; it must be float [s], or a date as logs have them"
                 raise MessageError(name, fault) from None
         seconds = time if time is None or in_si else time * self._clocks[name]
         if seconds is not None and abs(seconds) >= _LATEST:
             raise MessageError(name, f"is {time:.15g}: milliseconds? It must be in seconds")
-        return seconds
+        return seconds, None
 
     def _seen(self, told: dict[str, Any]) -> tuple[float | None, ...]:
         return tuple(told[name] for name in self.variables) or tuple(told["observation"])
 
-    def _of_end(self, told: dict[str, Any], time: float | None) -> End:
+    def _of_end(self, told: dict[str, Any], *when: float | None) -> End:
         if not told["end"]:
             raise MessageError("end", "is false; it must be true")
         omissions = [name for name in self._observed if name not in told]
         if 0 < len(omissions) < len(self._observed):
             raise MessageError(omissions[0], "is missing; a variable that was not seen is null")
-        return End(told.get("failed", False), None if omissions else self._seen(told), time)
+        return End(told.get("failed", False), None if omissions else self._seen(told), *when)
 
     def _of_scene(self, ego: _Vehicle, cars: list[_Vehicle], time: float, proposal: Any) -> Row:
         if not (self.scenes or self.variables == VARIABLES):

@@ -43,7 +43,7 @@ class Slots:
         """Raise where a row cannot be compared with a condition, or be one with others."""
         for option, term in self._terms:
             if fault := term.fault(row.told.get(term.column)):
-                raise MessageError(term.column, f"{fault} ({option})", row.time)
+                raise MessageError(term.column, f"{fault} ({option})", row.clock)
         if self.step and (row.ahead or not row.observation):
             raise MessageError("objects", "are not resampled; send rows of the variables", row.time)
 
@@ -95,14 +95,14 @@ class Slots:
         if not self.waiting:
             return None
         rows, self.waiting = self.waiting, []
-        begin = self._time(rows[0])
+        begin, hours = self._time(rows[0]), rows[0].hours
         self._done = begin if early else math.nan
         pairs = zip_longest(self.names, zip(*(row.observation or () for row in rows), strict=True))
         observation = tuple(_joined(self._how.get(name), cells) for name, cells in pairs if cells)
         proposals = [row.proposal for row in rows]
         are_numbers = all(isinstance(proposal, float | None) for proposal in proposals)
         how = self._how.get(self.columns.action) if are_numbers else "last"
-        return Row(begin + self.step, observation, _joined(how, proposals))  # at its end
+        return Row(begin + self.step, observation, _joined(how, proposals), hours=hours)
 
     def leave_out(self, row: Row) -> None:
         """Leave out what waits of the step of a row with which it failed: it is no whole one."""

@@ -40,9 +40,10 @@ class Text:
 
     def _said(self, part: Answer) -> Iterator[str]:
         kind, time, since = part["kind"], part.get("time"), self._since
+        when = "" if time is None else f"{date(time)}  "
+        time = time if time is None else time + 3600.0 * part.get("hours", 0.0)  # runs on
         if time is not None and since is not None and time < since:  # a clock that was set back
             since = self._since = None
-        when = "" if time is None else f"{date(time)}  "
         after = "" if time is None or since is None else f" {span(time - since)}"
         if kind == "error":
             yield f"{when}refused: {part['about']}: {part['error']}"
