@@ -96,6 +96,15 @@ def test_what_is_in_a_log_is_said_with_a_command_that_learns_from_it(evofsm, wri
         live = evofsm("monitor", path, "--guard", "guard.evofsm", "--text").stdout
         failures = r"^2025-03-1\d [0-9:]+  failure, \S+ \S+ after the alarm$"
         assert len(re.findall(failures, live, re.M)) == 7
+        rows, began = Path(path).read_bytes().splitlines(keepends=True), live.find("  alarm: ")
+        at = datetime.fromisoformat(live[:began].splitlines()[-1]).strftime("%d.%m.%Y %H:%M")
+        cut = max(k for k, row in enumerate(rows) if row.startswith(at.encode())) + 8
+        parts = []
+        for part in (rows[:cut], rows):  # as it is ended and begun anew in an alarm
+            Path("part.csv").write_bytes(b"".join(part))
+            words = "--guard", "guard.evofsm", "--state", "state", "--text"
+            parts.append(evofsm("monitor", "part.csv", *words).stdout)
+        assert ("alarm: " in parts[0], "".join(parts)) == (True, live)
         assert re.findall(rf"  alarm: {VIBRATION} [0-9.]+: above", live)
         assert "refused" not in live
 

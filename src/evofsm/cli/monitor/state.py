@@ -17,7 +17,7 @@ import msgspec
 
 from evofsm import store
 from evofsm.cli.journal import Journal, differences
-from evofsm.cli.monitor.decider import Decider
+from evofsm.cli.monitor.decider import Answer, Decider
 from evofsm.cli.monitor.messages import MessageError, Taken
 from evofsm.cli.show import warn
 from evofsm.guard import AuditLog, Guard, Head
@@ -73,8 +73,8 @@ class State:
             self._have_read(*record.get("read", ()))
         return Guard.load(self.path, failed=failed) if is_there else fresh()
 
-    def begin(self, decider: Decider) -> int:
-        """Go on where it was; returns the number of messages that were taken in again."""
+    def begin(self, decider: Decider, hear: Callable[[Answer], object] = bool) -> int:
+        """Go on where it was, and hear it; returns how many messages were taken in again."""
         self._decider, decider.keep = decider, self._keep
         if self._saved:
             decider.remember(self._saved["memory"])
@@ -89,7 +89,7 @@ class State:
         self._count = len(self._journal.records)
         for record in self._journal.records:
             try:
-                decider.act(msgspec.convert(record["told"], Taken))
+                hear(decider.act(msgspec.convert(record["told"], Taken)))
             except Exception as error:  # of another version: no reason not to begin
                 _log.error("%s: a message is left out: %s", self._journal.path, error)
         return self._count
