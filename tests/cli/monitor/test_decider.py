@@ -84,6 +84,10 @@ def test_in_words_it_is_said_where_the_risk_is_not_known():
     answers = [end, {**told, "alarm": True, "risk_proposed": 0.5}, end, end]
     assert text.line(answers[0]) == b"failure, no alarm was on\n"
     assert [text.line(x) for x in answers[1:3]][1] == b"failure, after the alarm\n"
+    stop = {"kind": "end", "failed": False, "reason": "not --where runs", "time": 63}
+    anew = {**answers[1], "time": 9, "alarm": False, "note": "time went back: a new episode"}
+    for last, words in ((stop, b"after 60 s (not --where runs)"), (anew, b"time went back: a new")):
+        assert (text.line(answers[1])[:9], words in text.line(last)) == (b"3  alarm:", True)
 
 
 def test_gaps_in_time_and_rows_that_come_too_often_are_noted():

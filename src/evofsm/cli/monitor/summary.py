@@ -39,12 +39,15 @@ class Text:
         return "".join(f"{visible(text)}\n" for part in parts for text in self._said(part)).encode()
 
     def _said(self, part: Answer) -> Iterator[str]:
-        kind, time, since = part["kind"], part.get("time"), self._since
+        kind, time, since, note = part["kind"], part.get("time"), self._since, part.get("note", "")
         when = "" if time is None else f"{date(time)}  "
-        time = time if time is None else time + 3600.0 * part.get("hours", 0.0)  # runs on
-        if time is not None and since is not None and time < since:  # a clock that was set back
+        time = math.nan if time is None else time + 3600.0 * part.get("hours", 0.0)  # runs on
+        if since is not None and ": a new episode" in note:  # after a hole, perhaps
+            yield f"{when}over: {note}"
             since = self._since = None
-        after = "" if time is None or since is None else f" {span(time - since)}"
+        lasts = math.nan if since is None else time - since
+        after = f" {span(lasts)}" if lasts >= 0.0 else ""
+        over = f"over, after{after}" if after else "over"
         if kind == "error":
             yield f"{when}refused: {part['about']}: {part['error']}"
         elif kind == "end":
@@ -52,10 +55,12 @@ class Text:
             if part["failed"]:
                 text = " no alarm was on" if since is None else f"{after} after the alarm"
                 yield f"{when}failure,{text}"
+            elif since is not None:
+                yield f"{when}{over} ({part.get('reason', 'the episode ended')})"
         elif kind == "decision":
             if part["alarm"] == (since is None):
                 self._since = time if part["alarm"] else None
-                text = f"alarm: {part['reason']}" if part["alarm"] else f"over, after{after}"
+                text = f"alarm: {part['reason']}" if part["alarm"] else over
                 yield f"{when}{text}"
             is_blind = part["risk_proposed"] is None and part.get("ahead", "") is not None
             if is_blind != self._is_blind:
