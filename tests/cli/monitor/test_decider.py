@@ -88,6 +88,12 @@ def test_in_words_it_is_said_where_the_risk_is_not_known():
     anew = {**answers[1], "time": 9, "alarm": False, "note": "time went back: a new episode"}
     for last, words in ((stop, b"after 60 s (not --where runs)"), (anew, b"time went back: a new")):
         assert (text.line(answers[1])[:9], words in text.line(last)) == (b"3  alarm:", True)
+    refused = {"kind": "error", "about": "line"}
+    lines = [text.line({**refused, "error": f"line {k}: is no row"}) for k in range(1, 30)]
+    assert lines[0] == b"refused: line 1: is no row\n"
+    assert [x for x in lines[1:] if x] == [b"refused: line 10: is no row (10 times by now)\n"]
+    lacks = [text.line({"kind": "waiting", "time": 9, "note": "no trip in the row"}) for _ in lines]
+    assert lacks[:2] == [b"9  note: no trip in the row\n", b""]
 
 
 def test_gaps_in_time_and_rows_that_come_too_often_are_noted():

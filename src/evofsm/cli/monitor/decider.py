@@ -124,17 +124,14 @@ class Decider:
 
     def _running(self, told: Message) -> Message:
         """A message by a clock that runs on as in logs, where summer time ends or begins."""
-        messages = [message for message, _ in self._recent]
-        rows = [m for m in messages if isinstance(m, Row) and m.hours is not None]
+        rows = [m for m, _ in self._recent if isinstance(m, Row) and m.hours is not None]
         if told.hours is None or told.time is None or not rows:
             return told
         times, hours = [row.clock for row in rows], [row.hours or 0.0 for row in rows]
         *_, before, unsaid = hours_unsaid(np.array([*times, time := told.time]), "")
         ways = [*{*hours}, hours[-1] + float(unsaid - before)]
-        candidates = [structs.replace(told, time=time + 3600.0 * h, hours=h) for h in ways]
-        return next(
-            (m for m in candidates if m in messages), candidates[-1]
-        )  # sent again, as it was
+        messages = [structs.replace(told, time=time + 3600.0 * h, hours=h) for h in ways]
+        return next((m for m in messages if m in rows), messages[-1])  # sent again, as it was
 
     def _sent_before(self, told: Message) -> int | None:
         """Where among the recent messages one is that is sent again; None if it is a new one.
@@ -150,8 +147,7 @@ class Decider:
             return len(recent) - 1
         if when is None:
             return None  # it says of no episode in particular that it ended
-        for place in range(len(recent) - 1, -1, -1):
-            message = recent[place][0]
+        for place, (message, _) in reversed([*enumerate(recent)]):
             if message == told:
                 return None if isinstance(told, Row) and self._begins_anew(told, place) else place
             is_older = message.time is not None and message.time < when
@@ -178,18 +174,17 @@ class Decider:
         latest = self.latest
         if self.slots.change(row, latest):
             return
-        when = row.clock
         if isinstance(latest, Row) and (row.hours is None) != (latest.hours is None):
             text = f"is {'no ' * (row.hours is None)}local time, unlike that of the row before"
             text += "; all have a zone, or none (an end between begins anew)"
-            raise MessageError("time", text, when)
+            raise MessageError("time", text, row.clock)
         if isinstance(latest, Row) and latest.time - _LATE <= row.time <= latest.time:
             text = f"comes after {date(latest.clock, ' s')}: late rows are left out"
             text = text if row.time < latest.time else "was decided on before, with other values"
-            raise MessageError("time", f"{date(when, ' s')} {text}", when)
+            raise MessageError("time", f"{date(row.clock, ' s')} {text}", row.clock)
         if self.slots.is_over(row):
             text = f"comes after its {self.slots.step:g} s were decided on, as nothing came"
-            raise MessageError("time", text, when)
+            raise MessageError("time", text, row.clock)
 
     def error(self, about: str, what: str, time: float | None = None) -> Answer:
         """What is answered where a message is refused."""

@@ -211,9 +211,8 @@ class Form:
 
     def _of_scene(self, ego: _Vehicle, cars: list[_Vehicle], time: float, proposal: Any) -> Row:
         if not (self.scenes or self.variables == VARIABLES):
-            raise MessageError(
-                "objects", "are for guards of car following; send a row of this guard's variables"
-            )
+            fault = "are for guards of car following; send a row of this guard's variables"
+            raise MessageError("objects", fault)
         if ego.vx < REVERSE:
             raise MessageError("ego.vx", f"is {ego.vx:g}; x counts along its direction of travel")
         _refuse_unplaced("ego", ego, ego)
@@ -240,8 +239,7 @@ def _action(guard: Guard) -> Any:
     if isinstance(actions, Choices):
         return Annotated[int, Meta(ge=0, le=actions.n_actions - 1)] | None
     if isinstance(actions, BoxActions):
-        components = int(np.size(actions.low))
-        length = Meta(min_length=components, max_length=components)
+        length = Meta(min_length=(n := int(np.size(actions.low))), max_length=n)
         return Annotated[tuple[_Number, ...], length] | None
     return _Number | None
 

@@ -32,6 +32,7 @@ class Text:
     def __init__(self) -> None:
         self._since: float | None = None  # when the alarm began that is on [s]
         self._is_blind = False  # whether the risk is not known
+        self._counts: dict[str, int] = {}  # of notes and refusals alike
 
     def line(self, answer: Answer) -> bytes:
         """What there is to say of one; mostly nothing."""
@@ -44,13 +45,17 @@ class Text:
         time = math.nan if time is None else time + 3600.0 * part.get("hours", 0.0)  # runs on
         if since is not None and ": a new episode" in note:  # after a hole, perhaps
             yield f"{when}over: {note}"
-            since = self._since = None
+            since, self._since, note = None, None, ""
         lasts = math.nan if since is None else time - since
         after = f" {span(lasts)}" if lasts >= 0.0 else ""
         over = f"over, after{after}" if after else "over"
-        if kind == "error":
-            yield f"{when}refused: {part['about']}: {part['error']}"
-        elif kind == "end":
+        if note or kind == "error":
+            text = f"note: {note}" if note else f"refused: {_refusal(part)}"
+            letters = "".join(filter(str.isalpha, text))
+            count = self._counts[letters] = self._counts.get(letters, 0) + 1
+            if str(count).strip("0") == "1":  # the 1st, 10th, 100th ...
+                yield f"{when}{text}{f' ({count:,} times by now)' * (count > 1)}"
+        if kind == "end":
             self._since = None
             if part["failed"]:
                 text = " no alarm was on" if since is None else f"{after} after the alarm"
@@ -60,12 +65,15 @@ class Text:
         elif kind == "decision":
             if part["alarm"] == (since is None):
                 self._since = time if part["alarm"] else None
-                text = f"alarm: {part['reason']}" if part["alarm"] else over
-                yield f"{when}{text}"
+                yield when + (f"alarm: {part['reason']}" if part["alarm"] else over)
             is_blind = part["risk_proposed"] is None and part.get("ahead", "") is not None
             if is_blind != self._is_blind:
                 yield f"{when}{part['reason'] if is_blind else 'the risk is known again'}"
             self._is_blind = is_blind
+
+
+def _refusal(answer: Answer) -> str:
+    return f"{answer['about']}: {answer['error']}".replace("line: line ", "line ", 1)
 
 
 Answers = Iterable[tuple[Answer, Row | None]]
@@ -108,7 +116,7 @@ def summary_of(decider: Decider, answers: Answers, title: str) -> Iterator[Rende
         elif answer["kind"] == "end" and answer["failed"] and rows:
             failed.append(len(rows) - 1)
         elif answer["kind"] == "error":
-            errors.append(f"{answer['about']}: {answer['error']}")
+            errors.append(_refusal(answer))
     if not rows:
         raise ValueError(f"{title}: nothing was decided ({'; '.join(errors[:1]) or 'no rows'})")
     times, risks, alarms, begins = np.array(numbers, np.float64).T
