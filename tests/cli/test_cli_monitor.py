@@ -190,7 +190,7 @@ def test_a_summary_says_how_often_it_alarms_and_is_risky_and_where_it_is_worst(t
     assert 0 < len(worst) <= 10
     assert worst[0][-2] == f"{max(map(max, risks)):.1%}"
     by_lines = evofsm(lines, *made)
-    assert "refused   1 messages, the first because line: line 1: is no JSON" in by_lines.stdout
+    assert "refused   1 messages, the first because line 1: is no JSON" in by_lines.stdout
     assert "failures  2; 1 in alarm by then, for " in by_lines.stdout
     assert [one[1] for one in numbers_of(by_lines.stdout)[:6]] == [one[1] for one in by_risk]
 
@@ -214,6 +214,7 @@ def test_a_summary_says_how_often_it_alarms_and_is_risky_and_where_it_is_worst(t
         (("--observe", "heat", "--low", 0, "--interval", 1), "give either low and high"),
         (("--n-actions", 2, "--traffic"), "--traffic is of cars"),
         (("a.csv", "--plot", "x.png"), "--plot draws what --summary says"),
+        (("a.parquet", "--text"), "a.parquet is read with --summary; live rows are JSON or CSV"),
         (("a.csv", "b.csv", "--summary"), "one FILE is read; cat joins several"),
     ],
 )

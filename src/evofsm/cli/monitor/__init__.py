@@ -102,6 +102,8 @@ def monitor(
     if plot is not None:
         options.require(matplotlib="plot")
     is_log = file is not None and (file.suffix in _LOGS[not summary :] or file.is_dir())
+    if is_log and not summary:
+        raise ValueError(f"{file} is read with --summary; live rows are JSON or CSV, a line each")
     if traffic and (guard or state or learn or is_log):
         raise ValueError("--traffic judges scenes alone: no log, --guard, --state or --learn")
     if summary and (file is None or state or audit):

@@ -191,8 +191,7 @@ class Decider:
         return self._of("error", time=time, about=about, error=what)
 
     def _of(self, kind: str, row: Row | None = None, **said: Any) -> Answer:
-        when = {} if row is None else {"time": row.clock}
-        when |= {"hours": row.hours} if row and row.hours else {}
+        when = {"time": row.clock, **({"hours": row.hours} if row.hours else {})} if row else {}
         return {"schema": messages.SCHEMA, "kind": kind, "n": self.n, **when, **said}
 
     def act(self, told: Taken) -> Answer:
