@@ -229,25 +229,6 @@ def test_a_later_file_is_read_by_its_own_header_or_refused_with_what_differs(evo
     assert learn(["mm.csv", "a.csv"], "--unit", "heat=mm").exit_code == 0
 
 
-@pytest.mark.parametrize(
-    ("last", "late", "said"),
-    [
-        (
-            "2025-10-16T19:35:00+02:00",
-            "2025-10-16T19:34:00+02:00",
-            "17:35 UTC to 2025-10-16 17:34 U",
-        ),
-        ("2025-10-16 19:35:00", "2025-10-16 19:34:00", "19:35 to 2025-10-16 19:34 within"),
-        ("1760636100", "1760636040", "17:35 UTC to 2025-10-16 17:34 UTC within"),
-        ("45946.816", "45946.815", "19:35:02.400 to 2025-10-16 19:33:36 within"),
-    ],
-)
-def test_times_say_that_they_are_in_utc_where_they_do_not_stand_so(refused, last, late, said):
-    Path("z.csv").write_text(f"t,p\n{last},1\n{late},2\n{last},3\n")
-    read = "learn", "z.csv", "--observe", "p", "--action", "", "--time", "t", "--skip-bad", "0"
-    assert f"from 2025-10-16 {said}" in refused(*read, *["--unit", "t=day"] * ("." in last))
-
-
 @pytest.mark.parametrize("month", [3, 10])
 def test_local_time_of_irregular_rows_runs_on_where_summer_time_changes(evofsm, month):
     chance, rows = random.Random(1), []
@@ -277,6 +258,7 @@ def test_local_time_of_irregular_rows_runs_on_where_summer_time_changes(evofsm, 
     *_, other, _, again = evofsm("monitor", "night.csv", *begun).stdout.splitlines()
     assert "line 4: is no local time, unlike that of the row before; all have" in other
     assert '"kind":"decision"' in again
+    assert "times of day are told in UTC" in again
 
 
 def test_failures_right_after_a_hole_are_counted_wherever_others_are(evofsm):

@@ -28,7 +28,7 @@ from evofsm.guard import ActionReviser, Foresight, Guard, LearntRisk, Mode
 from evofsm.guard.foresight import span
 from evofsm.io import Chunk, LogColumns, episodes_of, read_traces
 from evofsm.io.logs import Noted
-from evofsm.io.tables import SI, TIMES, UNITS, quoted_name
+from evofsm.io.tables import IN_UTC, SI, TIMES, UNITS, quoted_name
 
 # A unit at the end of a column's name, behind another letter or as a word of its own.
 _WORD = "(?:^|[^A-Za-z]|(?<=[a-z])(?=[A-Z]))"
@@ -206,6 +206,8 @@ def episodes_read(
             yield episode._replace(times=episode.times + notes.began) if dated else episode
     for warning in warnings_of(notes, columns):
         warn(f"warning: {warning}")
+    if dated and notes.in_utc:
+        warn(IN_UTC)
 
 
 # -- A guard --------------------------------------------------------------------------------------

@@ -283,7 +283,6 @@ def _dates(
         text = f"day or month first cannot be told of {texts[0]}; it is read as {day} (--unit)"
         asides.append(("the dates", text))
     clock = ",".join(names)
-    tables.SAID_IN["zone"] = ""
     frame = frame.drop(names).with_columns(read[day][2].cast(polars.Float64).alias(clock))
     return frame, clock, f"{clock}={day}{hour}"
 

@@ -21,6 +21,7 @@ from evofsm.driving.naming import RANGES, VARIABLES
 from evofsm.driving.naming import UNITS as CAR_UNITS
 from evofsm.fsm.naming import in_a_line
 from evofsm.fsm.observations import Category, ObservationEncoder
+from evofsm.guard.foresight import DATES
 from evofsm.io import tables, vehicles
 from evofsm.io.tables import Piece, Skips, Table, Wanted, is_number
 from evofsm.io.vehicles import ACTION, PairTable, VehicleLengths
@@ -120,6 +121,7 @@ class Noted:
     after_failure: int = 0  #: rows left out because the failure before them still held
     unplaced: int = 0  #: failures in rows without a leader, which belong to no episode
     began: float = 0.0  #: time 0, where that is a date, since 1970 [s]
+    in_utc: bool = False  #: whether times of day are, wherever the log is from
     failing: int = 0  #: rows that meet what tells of failures
     #: By column compared for that, what was there: the ends of its range in SI, or texts.
     compared: dict[str, list[Any]] = field(default_factory=dict)
@@ -938,13 +940,14 @@ class _Reader:
         times = np.where(piece.bad, np.nan, piece.numbers[self._columns.time])
         if not is_date:
             is_excel = np.abs(times - 3.9e9) < 8e8  # days since 1899-12-30
-            tables.SAID_IN["zone"] = " UTC" * (not is_excel.any())
+            self._noted.in_utc |= bool(times[0] >= DATES and not is_excel[0])
             return np.where(is_excel, times - 2_209_161_600.0, times)
         if np.isnan(self._first_date):
             self._first_date = times[np.argmin(np.isnan(times))]
             self._noted.began = self._clock.began = float(self._first_date) * _MICROSECOND
         dates = np.append(self._last_date, times) * _MICROSECOND
         sample = self._table.first(self._columns.time.rpartition(",")[2])
+        self._noted.in_utc |= ZONE.search(sample) is not None
         hours = hours_unsaid(dates, sample, self._hours)
         for row in np.flatnonzero(np.diff(hours))[: not self._hours]:
             self._noted.told.append(

@@ -88,7 +88,8 @@ _DATE = re.compile(r"\s*\d{4}-?\d\d-?\d\d[Tt ]")
 _DAY_FIRST = re.compile(r"\d\d?\.\d\d?\.(?:(\d{4})|\d\d),?[T ]+\d\d?:\d\d(:)?")
 _DATE_LIKE = re.compile(r"\s*(\d{1,4}|[A-Z][a-z]{2,8})([.:/ -])(\d\d?|[A-Za-z]{3,9})(\2|, )\d")
 _NO_DATE = 3e9  # from here on it is none: days of Excel in seconds, or another unit [s]
-SAID_IN = {"zone": " UTC"}  #: how times are; as they stand, once dates without a zone are read
+#: What is said where times of day are not as they stand in a log.
+IN_UTC = "times of day are told in UTC"
 _ISO = "in ISO 8601, such as 2026-03-14T09:26:53.5+01:00, or as 14.03.2026 09:26:53"
 _SAYS_HOW = "; --unit 'COLUMN=%m/%d/%Y %I:%M:%S %p' says how others are written"
 
@@ -774,7 +775,7 @@ def date(time: float, unit: str = "") -> str:
     if not DATES <= time < _NO_DATE:
         return f"{time:.13g}{unit}"
     text = f"{datetime.fromtimestamp(round(time, 3), UTC):%Y-%m-%d %H:%M:%S.%f}"
-    return text[:-3].removesuffix(".000").removesuffix(":00") + SAID_IN["zone"]
+    return text[:-3].removesuffix(".000").removesuffix(":00")
 
 
 def seconds_of_date(text: str, form: str = "") -> float:
@@ -791,7 +792,6 @@ def seconds_of_date(text: str, form: str = "") -> float:
             day, month, year, hour, rest = match.groups()
             text = f"{'20' * (len(year) == 2)}{year}-{month:0>2}-{day:0>2} {hour:0>2}{rest}"
         when = datetime.fromisoformat(text)
-    SAID_IN["zone"] = " UTC" * (when.tzinfo is not None)
     return when.replace(tzinfo=when.tzinfo or UTC).timestamp()
 
 
@@ -832,5 +832,4 @@ def _microseconds(
             dates = polars.Series(name, [None] * len(texts), polars.Datetime("us"))
     if dates.null_count():
         piece.leave_out(name, dates.is_null().to_numpy(), f"{why}{_SAYS_HOW}")
-    SAID_IN["zone"] = " UTC" * bool(getattr(dates.dtype, "time_zone", None))
     return dates.dt.epoch("us").cast(polars.Float64).to_numpy()

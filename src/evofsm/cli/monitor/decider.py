@@ -29,9 +29,10 @@ from evofsm.fsm import EvolvingFSM
 from evofsm.fsm.validation import probability
 from evofsm.guard import ActionReviser, BoxActions, Choices, Foresight, Guard, LearntRisk, Mode
 from evofsm.guard.api import Proposal, Revision
+from evofsm.guard.foresight import DATES
 from evofsm.guard.reviser import is_spoken, make_usable
 from evofsm.io.logs import Condition, hours_unsaid
-from evofsm.io.tables import date
+from evofsm.io.tables import IN_UTC, date
 
 _log = logging.getLogger(__name__)
 
@@ -356,6 +357,9 @@ class Decider:
             self._said.add("often")
             text = f"the guard was made for {interval:g} s: --resample {interval:g}s"
             yield f"rows come every {step:.3g} s, but {text}"
+        if row.hours is None and row.time >= DATES and IN_UTC not in self._said:
+            self._said.add(IN_UTC)
+            yield IN_UTC
         variables = zip(self.form.variables, self._units, row.observation or (), strict=False)
         fast = [name for name, unit, z in variables if unit == "m/s" and abs(z or 0.0) > _FAST]
         if fast and "fast" not in self._said:
