@@ -89,4 +89,5 @@ def test_what_told_the_guard_where_it_fails_is_named_by_its_module(evofsm, tmp_p
     assert again.exit_code == 0, again.output
     assert "5 decisions as recorded" in again.output
     other = evofsm("audit", path, "--failed", "builtins:any")
-    assert "DIFFERS at record" in other.output
+    assert "DIFFERS at record 8" in other.output
+    assert "failed: recorded false, replayed true" in other.output

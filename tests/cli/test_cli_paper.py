@@ -5,16 +5,26 @@ from pathlib import Path
 
 import pytest
 
+from evofsm import FSMModel
 from evofsm.paper import Settings
 
 
 @pytest.mark.slow
-def test_all_claims_hold_in_sumo_as_the_docs_show_them_and_the_page_is_named(evofsm, tmp_path):
-    folder = tmp_path / "out"
+def test_all_claims_hold_in_sumo_as_the_docs_show_them_and_all_of_it_is_written(
+    evofsm, read_page, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("sys.argv", ["evofsm", "paper"])
+    folder = tmp_path / "new" / "out"
     run = evofsm("paper", "--out", folder)
     assert run.exit_code == 0, run.stderr
     assert "10 of 10 claims of the paper hold" in run.stdout
     assert f"{folder}/index.html" in run.stdout.replace("\n", "")
+    read = read_page(folder / "index.html")
+    read.is_sound()
+    for said in ("Does the paper's machine", "evofsm paper", "#4 at 15 s"):
+        assert said in read.text
+    assert len(list((folder / "figures").iterdir())) == 12
+    assert FSMModel.load(folder / "model.evofsm").n_states == 7
     page = (Path(__file__).parents[2] / "docs" / "paper.md").read_text()
     for claim in json.loads((folder / "claims.json").read_text()):
         assert f"| {claim['claim']} | {claim['paper']} | {claim['measured']} | yes |" in page

@@ -1,26 +1,18 @@
-"""Guards for cars: two judges, what comes of episodes, and what was recorded."""
+"""What comes of episodes, and what was recorded."""
 
 import numpy as np
 import pytest
 
-from evofsm.driving.cars import TOLD, guard_for_cars, guard_for_family, learners_of, name_judge
+from evofsm.driving.cars import guard_for_cars, guard_for_family
 from evofsm.driving.family import held_out, load_family
-from evofsm.driving.judge import LatentRisk
 from evofsm.driving.trials import drive, outcome_of, reference_of, summarise, unrevised_guard
-from evofsm.guard.learnt.judge import LearntRisk
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
 EMERGENCY = load_family("emergency")
 
 
-def test_a_judge_is_made_by_its_name():
-    kinds = {"kinematic": LatentRisk, "learnt": LearntRisk}
-    assert set(kinds) == set(TOLD)
-    for name, kind in kinds.items():
-        _, judge = learners_of(guard_for_family(EMERGENCY, judge=name))
-        assert isinstance(judge, kind)
-        assert name_judge(judge) == name
+def test_a_judge_that_there_is_not_is_refused():
     with pytest.raises(ValueError, match="no judge 'wise'; there are kinematic, learnt"):
         guard_for_family(EMERGENCY, judge="wise")
 

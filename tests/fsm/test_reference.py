@@ -1,4 +1,10 @@
-"""The compiled machine against its twin in plain NumPy, which is the paper on one screen."""
+"""The compiled machine against what others made of the paper.
+
+A twin in plain NumPy, which is the paper on one screen, and a literal transcription of the
+equations; see golden/README.md.
+"""
+
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -51,3 +57,36 @@ def test_the_machine_is_its_twin(stream):
         (machine.origin_frequency, twin.frequencies),
     ):
         np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-10)
+
+
+# -- Golden vectors --------------------------------------------------------------------------------
+
+LEARNT = "centers", "potentials", "transition_matrices", "joint_frequency", "origin_frequency"
+
+
+def golden_of(name):
+    """What is in a file, and a machine with its settings."""
+    with np.load(Path(__file__).parents[1] / "golden" / f"{name}.npz") as archive:
+        golden = dict(archive)
+    q, distance_weight, radius, learning_rate, prior_frequency, spread = golden["params"]
+    settings = radius, distance_weight, learning_rate, prior_frequency, spread
+    return golden, EvolvingFSM(int(q), *settings)
+
+
+@pytest.mark.parametrize("name", ["paper_four_runs", "random_walk"])
+def test_every_row_and_what_is_learnt_in_the_end_are_the_golden_ones(name):
+    golden, machine = golden_of(name)
+    told = (golden[one] for one in ("observations", "actions", "episode_starts"))
+    trace = machine.learn_many(*told, belief=True)
+    for one in ("state", "n_states", "event"):
+        np.testing.assert_array_equal(getattr(trace, one), golden[one], err_msg=one)
+    np.testing.assert_allclose(trace.surprise, golden["jsd"], rtol=0, atol=1e-9)
+    assert np.flatnonzero(np.isnan(trace.surprise)).tolist() == list(golden["episode_starts"])
+    np.testing.assert_allclose(trace.belief[::25], golden["belief"], rtol=0, atol=1e-9)
+    for one in LEARNT:
+        learnt = getattr(machine, one)
+        np.testing.assert_allclose(learnt, golden[one], rtol=0, atol=1e-9, err_msg=one)
+
+
+def test_the_paper_preset_has_the_settings_of_the_papers_golden_run():
+    assert repr(EvolvingFSM.paper()) == repr(golden_of("paper_four_runs")[1])

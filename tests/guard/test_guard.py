@@ -365,14 +365,6 @@ def test_of_a_vector_what_need_not_change_does_not_and_nobody_can_change_what_wa
 # -- A judge's own search -----------------------------------------------------------------------
 
 
-def test_where_a_judge_searches_that_is_what_is_executed():
-    guard = searching()
-    first = guard.decide([0.2, 0.3], [0.9, 2.5])
-    assert "it would fall" in first.reason
-    assert first.risk_executed <= 0.02 < first.risk_proposed
-    assert "kept" in guard.decide([0.0, 0.0], [0.0, 2.5]).reason
-
-
 def test_what_a_search_finds_outside_is_put_into_the_set():
     class Bold(Searching):
         def search(self, situation, wanted, /, **how):

@@ -1,15 +1,13 @@
 """The paper's claims follow from its runs, under its settings and under others."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from evofsm import FSMModel
 from evofsm.driving import KinematicWorld
 from evofsm.paper import Settings, check_claims, run_paper
-from evofsm.paper.reproduction import divergences, page_of, write
+from evofsm.paper.reproduction import divergences, page_of
 
 PAGE = Path(__file__).parents[2] / "docs" / "paper.md"
 
@@ -89,18 +87,3 @@ def test_one_round_is_a_study_too_and_says_how_far_it_is_and_other_settings_are_
         drive(rounds=0)
     with pytest.raises(ValueError, match=r"\[machine\]: there is no 'radios'; known are radius"):
         Settings.load({"machine": {"radios": 1.0}})
-
-
-@pytest.mark.slow
-def test_all_of_it_is_written_and_can_be_read_back(tmp_path, read_page):
-    study = drive(rounds=2)
-    folder = tmp_path / "new" / "folder"
-    read = read_page(write(study, folder, "make paper"))
-    read.is_sound()
-    for said in ("Does the paper's machine", "make paper", "#4 at 15 s"):
-        assert said in read.text
-    assert len(list((folder / "figures").iterdir())) == 12
-    claims = json.loads((folder / "claims.json").read_text())
-    assert [claim["id"] for claim in claims] == [claim.id for claim in check_claims(study)]
-    model = FSMModel.load(folder / "model.evofsm")
-    assert np.array_equal(model.centers, study.model.centers)
