@@ -9,6 +9,7 @@ PAPER = {"low": -2.5, "high": 2.5, "width": 0.3}
 # Edges as a person writes them, not as floating point computes them.
 PAPER_EDGES = [-2.5, -2.2, -1.9, -1.6, -1.3, -1.0, -0.7, -0.4, -0.1]
 PAPER_EDGES += [0.2, 0.5, 0.8, 1.1, 1.4, 1.7, 2.0, 2.3, 2.5]
+BEYOND = r"outside \[-2.5, 2.5\].*clip"
 
 
 def test_intervals_meet_and_an_inner_edge_belongs_to_the_one_that_it_begins():
@@ -42,15 +43,21 @@ def test_values_beyond_the_range_fall_into_the_end_intervals_when_clipped():
 
 
 @pytest.mark.parametrize(
-    ("outside", "value", "words"),
+    ("outside", "value", "error", "words"),
     [
-        *(("error", value, r"outside \[-2.5, 2.5\].*clip") for value in (2.6, -math.inf)),
-        ("error", [0.0, math.nextafter(2.5, 3)], r"outside \[-2.5, 2.5\].*clip"),
-        *((outside, [0.0, math.nan], "NaN") for outside in ("error", "clip")),
+        *(("error", value, ValueError, BEYOND) for value in (2.6, -math.inf)),
+        ("error", [0.0, math.nextafter(2.5, 3)], ValueError, BEYOND),
+        *((outside, [0.0, math.nan], ValueError, "NaN") for outside in ("error", "clip")),
+        ("error", None, TypeError, "action is None; it must be a real number"),
+        ("error", 1j, TypeError, "action is 1j; it must be a real number"),
+        ("error", ["0.5", "1"], TypeError, "action has dtype <U3; it must be a real number"),
+        ("error", [0.0, None], TypeError, "action has dtype object; it must be a real number"),
     ],
 )
-def test_values_beyond_the_range_are_refused_and_nan_always(outside, value, words):
-    with pytest.raises(ValueError, match=words):
+def test_values_beyond_the_range_are_refused_and_what_is_no_number_always(
+    outside, value, error, words
+):
+    with pytest.raises(error, match=words):
         IntervalActions(**PAPER, outside=outside).encode(value)
 
 
@@ -60,21 +67,6 @@ def test_an_interval_that_does_not_exist_is_refused(i):
     for method in (actions.interval, actions.center, actions.label):
         with pytest.raises(ValueError, match=f"interval is {i}; there are intervals 0 to 16"):
             method(i)
-
-
-@pytest.mark.parametrize(
-    ("value", "words"),
-    [
-        (None, "action is None"),
-        (1j, "action is 1j"),
-        (["0.5", "1"], "action has dtype <U3"),
-        ([0.0, None], "action has dtype object"),
-    ],
-)
-def test_an_action_that_is_no_number_is_named(value, words):
-    actions = IntervalActions(**PAPER)
-    with pytest.raises(TypeError, match=f"{words}; it must be a real number"):
-        actions.encode(value)
 
 
 @pytest.mark.parametrize(

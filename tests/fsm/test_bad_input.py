@@ -98,10 +98,6 @@ def test_a_failure_that_is_neither_true_nor_false(machine):
     refuses(machine, lambda m: m.observe([0.0, 1.0], failed="no"), TypeError, "failed is 'no'")
 
 
-def test_a_failure_before_any_observation():
-    refuses(EvolvingFSM(3), EvolvingFSM.fail, ValueError, "fail before observe")
-
-
 NO_SIZES = [0.0, -1.0, NAN, INF, "wide", 1j, [0.1, 0.2]]
 SETTINGS = {
     **dict.fromkeys(["radius", "spread"], NO_SIZES),
