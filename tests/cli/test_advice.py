@@ -216,24 +216,16 @@ def packed(tool, ending):
     return make
 
 
-def as_array(text):
-    np.save("drive.npy", np.loadtxt(text.splitlines(), delimiter=",", skiprows=1))
-    return "drive.npy"
+def written(name, write):
+    def make(text):
+        write(name, polars.read_csv(text.encode()))
+        return name
+
+    return make
 
 
-def as_arrow(text):
-    polars.read_csv(text.encode()).write_ipc("drive.arrow")
-    return "drive.arrow"
-
-
-def as_json(text):
-    Path("rows.jsonl").write_text(polars.read_csv(text.encode()).write_ndjson())
-    return "rows.jsonl"
-
-
-def as_utf_16(text):
-    Path("own.csv").write_text(text, encoding="utf-16")
-    return "own.csv"
+def as_utf_16(name, table):
+    Path(name).write_text(table.write_csv(), encoding="utf-16")
 
 
 @pytest.mark.parametrize(
@@ -243,10 +235,10 @@ def as_utf_16(text):
         (packed("xz --format=lzma", "lzma"), "drive.csv"),
         (packed("bzip2", "bz2"), "drive.csv"),
         (packed("zstd --rm -q", "zst"), "drive.csv"),
-        (as_array, "drive.csv"),
-        (as_arrow, "drive.parquet"),
-        (as_json, "drive.csv"),
-        (as_utf_16, "drive.csv"),
+        (written("drive.npy", np.save), "drive.csv"),
+        (written("drive.arrow", lambda name, table: table.write_ipc(name)), "drive.parquet"),
+        (written("rows.jsonl", lambda name, table: table.write_ndjson(name)), "drive.csv"),
+        (written("own.csv", as_utf_16), "drive.csv"),
     ],
 )
 def test_a_command_that_is_advised_makes_a_file_that_is_read(evofsm, make, read):
