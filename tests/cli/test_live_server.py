@@ -151,6 +151,33 @@ def test_who_connects_and_says_nothing_does_not_hold_up_the_end(shown):
     silent.close()
 
 
+def test_who_comes_late_is_shown_all_of_it(page):
+    with looking_on(page) as first:
+        for number in range(3):
+            first.send('{"do": "step"}')
+            assert told(first, "frame")["number"] == number
+    with looking_on(page) as later:
+        whole = json.loads(later.recv(timeout=60))
+    kinds = [part["kind"] for part in whole["parts"]]
+    assert kinds[0] == "start"
+    assert kinds.count("frame") == 3
+    assert {"clock", "graph"} <= set(kinds)
+
+
+def test_pages_act_on_the_run(page):
+    with looking_on(page) as client:
+        told(client, "clock")
+        for command, name, value in [
+            ({"do": "revise", "value": False}, "revising", False),
+            ({"do": "speed", "value": 8}, "speed", 8.0),
+            ({"do": "pause", "value": False}, "paused", False),
+        ]:
+            client.send(json.dumps(command))
+            assert told(client, "clock")[name] == value
+        client.send(json.dumps({"do": "case", "value": 3}))
+        assert told(client, "start")["case"] == 3
+
+
 def test_a_run_waits_for_the_first_who_looks_on(shown):
     with shown(session, speed=math.inf, awaits=True) as page:
         assert get(page, f"/{page.token}/")[0] == 200  # who loads the page only sees nothing yet
