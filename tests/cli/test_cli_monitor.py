@@ -175,6 +175,7 @@ def test_a_summary_says_how_often_it_alarms_and_is_risky_and_where_it_is_worst(t
     result = evofsm(log, *made, *columns)
     assert result.exit_code == 0, result.stderr
     assert "assumed: the own car brakes with 5 m/s²" in result.stderr
+    assert "(83 are given)" in " ".join(result.stderr.split())
     assert f"{decided:,} in 2 episodes, {decided / 36000.0:.3g} h" in result.stdout
     found = numbers_of(result.stdout)
     by_risk, worst = found[:6], found[6:]

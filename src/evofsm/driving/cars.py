@@ -157,6 +157,6 @@ def assumptions(brakes: float, tolerance: float) -> str:
     share = (1 + LEADERS.counts[-1]) / (1 + sum(LEADERS.counts))
     return (
         f"assumed: the own car brakes with {brakes:g} m/s², at once (--brakes), {share:.0%} of "
-        f"leaders' hard brakes are in full ({_FULL:g} m/s²), the others as in public drives "
-        f"({sum(LEADERS.counts)} are given); a risk of {tolerance:.3g} is accepted (--tolerance)"
+        f"leaders' hard brakes are in full ({_FULL:g} m/s²), the others as in public drives ("
+        f"{sum(REAL_DRIVES.counts)} are given); a risk of {tolerance:.3g} is accepted (--tolerance)"
     )
