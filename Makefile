@@ -21,7 +21,7 @@ closed-loop: .venv/installed    ## does the reviser prevent collisions, at what 
 	@$(BIN)/python -m studies closed-loop --out results/closed-loop
 
 PYTEST = $(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist worksteal --durations=10
-test: .venv/installed           ## the quick tests, doctests included; a few minutes
+test: .venv/installed           ## the quick tests, doctests included; some minutes
 	@$(PYTEST) -m 'not slow'
 
 test-all: test                  ## those, and the slow rest: whole studies, torture, the browser
