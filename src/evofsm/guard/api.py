@@ -77,7 +77,7 @@ class Revision(NamedTuple):
 
     executed: Action  #: action to execute; of a car the acceleration [m/s²]
     proposed: Action  #: action that the controller wanted; NaN where it had none
-    risk_proposed: float  #: probability of failure under the proposal; NaN where not judged
+    risk_proposed: float  #: `Judgement.risk` of the proposal; NaN where not judged
     risk_executed: float  #: the same for what is executed
     interval: tuple[float, float]  #: 90 % interval of `risk_executed`
     reason: str  #: in a few words
@@ -111,8 +111,8 @@ class Reviser(Protocol):
 class Judgement(NamedTuple):
     """How dangerous some actions are; an entry for each of them.
 
-    ``risk`` is the probability that failure can no longer be avoided if the action is taken now,
-    with its 90 % interval from ``low`` to ``high``.
+    ``risk`` is the probability that failure can no longer be avoided if the action is taken now, of
+    cars if the leader brakes hard right then, with its 90 % interval from ``low`` to ``high``.
     """
 
     risk: Floats  #: (k,)

@@ -400,8 +400,9 @@ class AuditLog(Ledger, Recorder, AbstractContextManager["AuditLog"]):
     path : Path
         A file that is there is gone on with; a half-written end is cut off.
     sync : {"record", "episode"}
-        When records are forced onto the disk: each, before its action is executed, or those of an
-        episode at its end, which takes no time while driving.
+        When records are forced onto the disk: those that say something before their action is
+        executed (of others a power cut may lose 240), or all of an episode at its end, which takes
+        no time while driving.
 
     Raises
     ------

@@ -128,8 +128,9 @@ class Guard:
     """Keeps any controller from failing: a state machine, a judge and a reviser that learn.
 
     Before an action is executed, the judge says how likely it is that failure can no longer be
-    avoided after it. A proposal within the tolerance is kept; any other is replaced by the closest
-    action that is tolerable. The machine recognises and counts the states in which that happens.
+    avoided after it. A proposal that is tolerable (to a learnt judge by a margin, too) is kept; any
+    other is replaced by the closest action that is, or else by the least risky, which may be the
+    proposal. The machine recognises and counts the states in which that happens.
     An episode begins with the first `decide` after `end`.
 
     Parameters
@@ -163,7 +164,7 @@ class Guard:
         How far ahead a learnt judge looks, and what the machine's explanations call soon [s].
         Without it a learnt judge looks as far as it finds that it has to.
     tolerance : float
-        Highest risk that is accepted, in (0, 1).
+        Highest risk that is accepted, unless nothing has less, in (0, 1).
     mode : Mode
         Whether what it decides is executed, or only recorded.
     seed : int
@@ -174,9 +175,9 @@ class Guard:
         Whether `Revision.explanation` holds the machine's experience for every decision; with an
         audit log it does for those that change a proposal or warn.
     shadow : bool
-        Whether proposals pass in some episodes while a learnt judge learns, as long as it was not
-        shown to help, and in all where it is frozen so (`evofsm.guard.harm`). Without it, one that
-        does harm is not noticed.
+        Whether proposals pass in some episodes while a learnt judge learns, where it is in doubt
+        that it helps, and in all where it is frozen and does not (`evofsm.guard.harm`). Without it,
+        one that does harm acts on.
 
     Raises
     ------
@@ -382,10 +383,10 @@ class Guard:
     def freeze(self) -> None:
         """Learn nothing from now on: the same episode is decided the same again, bit for bit.
 
-        An episode that is under way is broken off: nothing more is learnt from it. Where it steps
-        back, or guarded episodes seem to fail sooner than those of the controller alone, proposals
-        pass. It warns of that, of one that refuses nearly all, or keeps it from its goal, and where
-        ``failed`` misses some.
+        An episode that is under way is broken off: nothing more is learnt from it. Where guarded
+        episodes ended worse than those of the controller alone, or prevented too few failures,
+        proposals pass (`evofsm.guard.harm`). It warns of that, of one that refuses nearly all, or
+        keeps it from its goal, and where ``failed`` misses some.
         """
         self.learn = False
         if why := self._why_passing():

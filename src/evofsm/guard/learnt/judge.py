@@ -63,9 +63,9 @@ class Consequence(NamedTuple):
 class LearntRisk(ObservingJudge, SearchingJudge):
     """Judges actions by what it has learnt of how the system moves and fails.
 
-    It is told neither what variables mean nor how they move. Before the first failure of an episode
-    there is nothing that it could prevent, and all is kept; in the first episode also where failure
-    was given as a function.
+    It is told neither what variables mean nor how they move. Before the first episode that failed
+    there is nothing that it could prevent, and all is kept; where failure was given as a function,
+    before the first episode is over.
 
     It learns of at most 64 variables, fewer where actions have more than 25 numbers, and expects
     products of two up to 12 variables, of actions with variables up to 80 such products.
@@ -94,8 +94,9 @@ class LearntRisk(ObservingJudge, SearchingJudge):
 
     Notes
     -----
-    A search is cut short after as many steps of rollouts as take a tenth of the interval, of three
-    at least; its reason says so. They are counted, not timed: it comes out the same again.
+    A search is cut short after as many steps of rollouts as take a tenth of the interval, one
+    horizon of each backup asked at least; its reason says so. They are counted, not timed: it comes
+    out the same again.
 
     The risk of an action is the probability that within the horizon something begins that no
     backup survives after it: ``1 - exp(-unsurvived / exposure * horizon)``, from the number of
