@@ -15,9 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import one_guard
-from evofsm import EvolvingFSM, Guard, Labels, store
+from evofsm import EvolvingFSM, Guard, IntervalActions, Labels, store
 from evofsm.driving.cars import guard_for_cars
 from evofsm.driving.judge import LatentRisk
+from evofsm.driving.revisers import Unrevised
 from evofsm.guard.actions import Choices, put_into, same_action
 from evofsm.guard.api import ActionJudge, Fallback, Judgement, Proposal, Search
 from evofsm.guard.guard import KIND
@@ -438,6 +439,9 @@ def test_settings_of_the_reviser_are_looked_at_where_they_are_set():
         for name, value in (("mode", "on"), ("tolerance", 5.0), ("tolerance", math.nan)):
             with pytest.raises(ValueError, match=f"^{name} is"):
                 setattr(one, name, value)
+    unrevised = Guard.of(Unrevised(IntervalActions(-2.5, 2.5, 0.3)), interval=DT)
+    with pytest.raises(AttributeError, match="Unrevised has no mode"):
+        unrevised.mode = "shadow"
 
 
 def test_a_machine_of_other_actions_is_refused():

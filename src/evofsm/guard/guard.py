@@ -118,10 +118,15 @@ KIND = Kind(
 )
 
 
-def _of_reviser(name: str) -> Any:
+def _of_reviser(name: str, doc: str) -> Any:
     """A setting of a guard's reviser, which may be changed by the guard, too."""
-    read = attrgetter(f"reviser.{name}")
-    return property(read, lambda guard, value: setattr(guard.reviser, name, value), doc="")
+
+    def change(guard: Guard, value: Any) -> None:
+        if not hasattr(guard.reviser, name):
+            raise AttributeError(f"{type(guard.reviser).__name__} has no {name}, and heeds none")
+        setattr(guard.reviser, name, value)
+
+    return property(attrgetter(f"reviser.{name}"), change, doc=doc)
 
 
 class Guard:
@@ -361,7 +366,8 @@ class Guard:
         self.shadow = truth("shadow", shadow)
         self.learn = learn
 
-    mode, tolerance = map(_of_reviser, ("mode", "tolerance"))
+    mode = _of_reviser("mode", "How far its reviser goes, a `Mode`; may be changed at any time.")
+    tolerance = _of_reviser("tolerance", "Highest risk that its reviser accepts, in (0, 1).")
 
     @property
     def learn(self) -> bool:

@@ -75,10 +75,10 @@ def monitor(
     """Decide alongside a stack of your own: rows in, decisions out, a JSON line each.
 
     A row: {"time": 0.1, "gap": 32, "v_follower": 20, "v_leader": 18, "proposal": 0.5}, in s, m,
-    m/s and m/s²; docs/monitor.md describes all messages. Nothing is learnt without --learn, and
-    nothing is changed without --mode act. Ctrl-C or SIGTERM ends it, with everything saved. Rows
-    are read as options from --observe to --hole say, without one as the guard's log was, whatever
-    default stands there.
+    m/s and m/s²; docs/monitor.md describes all messages. Without --learn only a guard that begins
+    learns; nothing is changed without --mode act. Ctrl-C or SIGTERM ends it, with everything saved.
+    Rows are read as options from --observe to --hole say, without one as the guard's log was,
+    whatever default stands there.
 
     To begin a guard of any system say what is observed (--observe), how often (--interval or
     --resample), and who acts: --low and --high, --n-actions, or nobody (--action '').
