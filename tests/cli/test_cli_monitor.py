@@ -106,6 +106,17 @@ def test_a_file_is_taken_in_once_and_as_it_grows_what_is_new_of_it(tmp_path):
     assert answers(log, *rows)[0] == answers(other, *rows[:20])[0] == []
 
 
+def test_a_guard_that_began_beside_a_machine_is_given_to_another_monitor(tmp_path):
+    state, other = tmp_path / "state.evofsm", tmp_path / "other.evofsm"
+    rows = [json.dumps({"time": t, "x": x, "proposal": 0}).encode() for t, x in enumerate((0, 2))]
+    system = ("--observe", "x", "--low", -1, "--high", 1, "--interval", 1, "--failed", "x>1")
+    assert evofsm(*system, "--state", state, lines=rows).exit_code == 0
+    for options in ((), ("--failed", "x>1 and x<9"), ("--state", other), ("--state", other)):
+        result = evofsm("--guard", state, *options, lines=rows)
+        assert result.exit_code == 0, result.stderr
+        assert told(result)[-1]["failed"] is True  # though --failed need not be typed again
+
+
 def test_csv_with_a_column_twice_is_refused():
     names, row = b"time,gap,gap,v_follower,v_leader,a_follower", b"0,1,100,20,20,0"
     head, first = told(evofsm(lines=[names, row]))

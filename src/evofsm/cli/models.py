@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from evofsm.fsm.explanation import Explanation
 from evofsm.guard import Foresight, Guard, LearntRisk
 from evofsm.guard.learnt.failure import telling
 from evofsm.io import read_traces
+from evofsm.io.logs import Condition
 
 # What folders of results hold, in the order in which it is looked for.
 _MODELS = ("guard.evofsm", "model.evofsm")
@@ -34,6 +35,23 @@ def load_guard(path: Path) -> Guard:
     if isinstance(guard.judge, LearntRisk):
         guard.failed = guard.judge.failed = None  # it only stood in
     return guard
+
+
+def failure(text: str | None, names: Sequence[str]) -> Callable[[Any], bool] | None:
+    """What says of an observation whether it fails; None where that takes other columns."""
+    condition = Condition.parse(text or names[0])
+
+    def failed(z: Any) -> bool:
+        return condition.holds_of(dict(zip(names, z, strict=True)))
+
+    return failed if text and {term.column for term in condition.terms} <= {*names} else None
+
+
+def load_learning(path: Path, text: str | None) -> Guard:
+    """A guard that may learn on; one that knew failures by a function knows them by ``text``."""
+    was_told = store.read_header(path).settings.get("failed")
+    names = load_guard(path).variables if text and was_told else ()
+    return Guard.load(path, failed=failure(text, names) if names else None)
 
 
 def load_model(place: Path) -> tuple[FSMModel, store.Header, Guard | None]:

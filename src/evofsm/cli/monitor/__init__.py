@@ -109,6 +109,7 @@ def monitor(
         raise ValueError("--traffic judges scenes alone: no log, --guard, --state or --learn")
     if summary and (file is None or state or audit):
         raise ValueError("--summary needs FILE, and goes with no --state or --audit")
+    from evofsm.cli.models import load_learning
     from evofsm.cli.monitor.decider import EPISODE, Decider, begun, prepare
     from evofsm.cli.monitor.slots import Slots
     from evofsm.cli.monitor.state import State
@@ -118,7 +119,7 @@ def monitor(
     from evofsm.driving.cars import assumptions, guard_of_monitor
     from evofsm.driving.naming import VARIABLES
     from evofsm.fsm import Labels
-    from evofsm.guard import AuditLog, Foresight, Guard
+    from evofsm.guard import AuditLog, Foresight
     from evofsm.io.tables import is_number
 
     acts = {"low": low, "high": high, "n_actions": n_actions}
@@ -131,17 +132,16 @@ def monitor(
     system = {name: part for name, part in parts.items() if part is not None}
     how: Any = brakes, options.TOLERANCE if tolerance is None else tolerance
     make: Any = partial(guard_of_monitor, interval or _INTERVAL, *how, traffic=traffic)
-    notice, failed = assumptions(*how), None
+    notice, reader = assumptions(*how), {**options.read_with(guard or state), **reading}
     if guard is not None:
-        make, notice = partial(Guard.load, guard), f"assumed: what {guard} was given and has learnt"
+        make = partial(load_learning, guard, reader.get("failed"))
+        notice = f"assumed: what {guard} was given and has learnt"
     elif not is_log and (system or "action" in reading):
         if traffic:
             raise ValueError("--traffic is of cars, and goes with no --observe or --action")
         make, learn = partial(begun, system, reading, interval, tolerance, alarms), True
-        failed = (new_guard := make()).failed
-        notice = f"a guard of {', '.join(new_guard.variables)} learns from what comes"
-    reader, rows = {**options.read_with(guard or state), **reading}, EPISODE
-    learnt_of = reader.pop("observe", None)
+        notice = f"a guard of {', '.join(make().variables)} learns from what comes"
+    rows, learnt_of = EPISODE, reader.pop("observe", None)
     observe = observe or learnt_of
     if episode is not None and is_number(episode) and not is_log:
         if not (episode.isdecimal() and int(episode)):
@@ -190,11 +190,13 @@ def monitor(
             ways = {"mode": mode, "learn": learn, "tolerance": tolerance, "episode": ends}
             ways["false_a_day"] = false_a_day
             columns = {k: v for k, v in reader.items() if k != "topics"}
-            keeper = State(state, {"guard": digest, **columns, **basics, **ways, **system})
+            read_with = {**columns, "observe": observe} if observe else {}
+            settings = {"guard": digest, **columns, **basics, **ways, **system}
+            keeper = State(state, settings, read_with)
             stack.callback(keeper.close)
         elif learn and not summary:
             warn("nothing of what is learnt is saved; --state FILE saves it")
-        sentry = make() if keeper is None else keeper.guard(make, failed)
+        sentry = make() if keeper is None else keeper.guard(make, reader.get("failed"))
         prepare(sentry, mode, tolerance, alarms)
         sentry.learn = learn
         if audit is not None:

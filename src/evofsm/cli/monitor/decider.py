@@ -16,6 +16,7 @@ from msgspec import structs
 from numpy.typing import NDArray
 
 from evofsm.cli.foreseen import guard_of_alarms
+from evofsm.cli.models import failure
 from evofsm.cli.monitor import messages
 from evofsm.cli.monitor.messages import End, Form, Message, MessageError, Pause, Row, Taken
 from evofsm.cli.monitor.slots import CsvRows, Slots
@@ -31,7 +32,7 @@ from evofsm.guard import ActionReviser, BoxActions, Choices, Foresight, Guard, L
 from evofsm.guard.api import Proposal, Revision
 from evofsm.guard.foresight import DATES
 from evofsm.guard.reviser import is_spoken, make_usable
-from evofsm.io.logs import Condition, hours_unsaid
+from evofsm.io.logs import hours_unsaid
 from evofsm.io.tables import IN_UTC, date
 
 _log = logging.getLogger(__name__)
@@ -476,17 +477,11 @@ def begun(
         except ValueError:
             raise ValueError(f"--{name} is {acts[name]!r}; write a number, or -1,-1") from None
         acts[name] = ends if len(ends) > 1 else ends[0]
-    condition = Condition.parse(columns.failed or names[0])
-
-    def failed(z: Any) -> bool:
-        return condition.holds_of(dict(zip(names, z, strict=True)))
-
-    is_told = columns.failed and {term.column for term in condition.terms} <= {*names}
     return Guard(
         **acts,
         interval=step,
         judge=LearntRisk(step, horizon=alarms[0], names=names, **acts),
-        failed=failed if is_told else None,
+        failed=failure(columns.failed, names),
         tolerance=TOLERANCE if tolerance is None else tolerance,
         mode=Mode.SHADOW,
     )

@@ -17,6 +17,7 @@ import msgspec
 
 from evofsm import store
 from evofsm.cli.journal import Journal, differences
+from evofsm.cli.models import load_learning
 from evofsm.cli.monitor.decider import Answer, Decider
 from evofsm.cli.monitor.messages import MessageError, Taken
 from evofsm.cli.show import warn
@@ -31,13 +32,15 @@ _PROVENANCE = "monitor"
 class State:
     """Keeps a monitor in files. Close it after use."""
 
-    def __init__(self, path: Path, settings: Mapping[str, Any]) -> None:
+    def __init__(
+        self, path: Path, settings: Mapping[str, Any], read_with: Mapping[str, Any] | None = None
+    ) -> None:
         self.path = path.resolve()
         self.settings = dict(settings)
         self.failure = ""  #: why nothing is saved; empty as long as it is
         journal = self.path.with_name(f"{self.path.name}.journal")
         self._journal = Journal(journal, "name another file")
-        self._provenance: dict[str, Any] = {}
+        self._provenance: dict[str, Any] = {"read with": read_with} if read_with else {}
         self._saved: dict[str, Any] = {}  # what stands beside the guard
         self._mark = 0
         self._decider: Decider  # once it has begun
@@ -45,9 +48,7 @@ class State:
         self._files: list[str] = []  # digests of what was read of each
         self._place: int | None = None  # among these, of the file that is read
 
-    def guard(
-        self, fresh: Callable[[], Guard], failed: Callable[[Any], bool] | None = None
-    ) -> Guard:
+    def guard(self, fresh: Callable[[], Guard], failed: str | None = None) -> Guard:
         """The guard as it was saved; a fresh one where there is none."""
         journal, is_there = self._journal, self.path.exists()
         if is_there:
@@ -71,7 +72,7 @@ class State:
             )
         for record in journal.records:
             self._have_read(*record.get("read", ()))
-        return Guard.load(self.path, failed=failed) if is_there else fresh()
+        return load_learning(self.path, failed) if is_there else fresh()
 
     def begin(self, decider: Decider, hear: Callable[[Answer], object] = bool) -> int:
         """Go on where it was, and hear it; returns how many messages were taken in again."""

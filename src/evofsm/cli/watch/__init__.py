@@ -49,10 +49,10 @@ def watch(
     when it is first opened. Ctrl-C ends it.
     """
     options.require(websockets="watch")
+    from evofsm.cli.models import load_learning
     from evofsm.cli.show import say
     from evofsm.cli.watch import session
     from evofsm.cli.watch.server import LivePage, Player
-    from evofsm.guard import Guard
 
     async def serve(run: session.Session) -> None:
         async with LivePage() as page:
@@ -71,9 +71,11 @@ def watch(
     with suppress(KeyboardInterrupt):
         if is_log:
             risk = None if tolerance == options.TOLERANCE else tolerance
-            log_guard = None if guard is None else Guard.load(guard)
+            reader = {**options.read_with(guard), **reading}
+            failed = reader.get("failed")
+            log_guard = None if guard is None else load_learning(guard, failed)
             try:
-                log_format = options.reading_of(**{**options.read_with(guard), **reading})
+                log_format = options.reading_of(**reader)
                 is_simulation = what.endswith((".sumocfg", ".sumo.cfg"))
                 show = session.watched_simulation if is_simulation else session.watched_log
                 run = show(what, log_format, risk, case, log_guard, brakes=brakes)
