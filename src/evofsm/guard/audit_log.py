@@ -6,8 +6,8 @@ for the first): a hash chain as in Haber and Stornetta (J. Cryptology 3, 1991).
 
 What a guard is told and decides is one record each, made by a `Recorder`. An audit also decides
 again, without a world: the guard that the log began with is told the same, and what a recorder
-then makes of it must be what was recorded, to the last bit. So neither a forged decision nor a
-forged model hides behind a chain that was made anew.
+then makes of it must be what was recorded, to the last bit. So neither a decision that does not
+follow nor a forged model hides behind a chain that was made anew.
 """
 
 from __future__ import annotations
