@@ -1,6 +1,6 @@
 """A point in the plane that must not enter a disc, which nobody tells the guard of.
 
-    python examples/disc.py disc.png
+    python examples/disc.py disc.png 2
 
 The guard sees place and speed, and which episodes failed. It learns while one controller heads for
 places all around; then, frozen, it guards another that heads straight for a goal on the other side.
@@ -150,4 +150,4 @@ def main(path: str = "disc.png", seed: int = 2, held_out: int = 50) -> dict[int,
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main(*sys.argv[1:2], *map(int, sys.argv[2:]))
