@@ -164,9 +164,9 @@ def write(
     numbers = b"".join(array.tobytes() for array in arrays.values())
     if len(head) > _LARGEST_HEADER or len(numbers) > _LARGEST_FILE:
         raise ValueError(f"{kind.name} is too large for a file: more than {_LARGEST_FILE:,} bytes")
-    data = len(head).to_bytes(8, "little") + _signed(head, _sha256(head, numbers)) + numbers
+    signed_head = _signed(head, _sha256(head, numbers))
     with replacing(place) if isinstance(place, str | os.PathLike) else nullcontext(place) as file:
-        file.write(data)
+        file.writelines((len(head).to_bytes(8, "little"), signed_head, numbers))
 
 
 def _head(header: Header, arrays: Mapping[str, NDArray[Any]]) -> bytes:

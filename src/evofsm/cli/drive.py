@@ -92,7 +92,7 @@ def drive(
     from evofsm.cli import driving
     from evofsm.cli.show import facts, print_json, progress, say, show, warn
 
-    if family.endswith((".sumocfg", ".sumo.cfg")):
+    if family.endswith(options.SUMO):
         common = {"family", "vehicles", "mode", "tolerance", "as_json"}
         options.refuse_typed(ctx, sorted(ctx.params.keys() - common), "families of scenarios")
         driving.run_configuration(Path(family), vehicles, mode, tolerance, as_json=as_json)

@@ -39,12 +39,11 @@ _FRAME = re.compile("frame([^a-z]|$)", re.IGNORECASE)  # it counts steps of the 
 # Other dates: the year first, or the day or the month, which may be a name.
 _OTHER = re.compile(r"(\d+)([/ -])(\w+)\2(\d{2,4})(,? )\d\d?:\d\d(:\d\d(\.\d+)?)?( [AP]M)?$", re.I)
 _WORDS = re.compile(r"[A-ZÄÖÜ]+(?![a-zäöüß])|[A-ZÄÖÜ]?[^\W\d_A-ZÄÖÜ]+")  # in a name
-_SET = re.compile(  # of what somebody sets; the last of them of what is not measured
-    r"^(u|acc(el(eration)?)?)$|\b(actions?|cmd|commands?|throttle|setpoint|\w*soll|soll\w*|stell\w*)\b"
-    r"|^(?!.*\b(temp\w*|press\w*|\w*druck|vib\w*|rms|curr\w*|strom|flow|leak\w*|no|nr|id)\b)"
-    r".*\b(set|valves?|\w*ventil)\b",
-    re.IGNORECASE,
-)
+# What somebody sets is called so, or has such a word; or one of these, and none of the last.
+_ACTION = re.compile("u|acc(el(eration)?)?", re.IGNORECASE)
+_SET = re.compile("actions?|cmd|commands?|throttle|setpoint|soll.*|.*soll|stell.*", re.IGNORECASE)
+_MAY_SET = re.compile("set|valves?|.*ventil", re.IGNORECASE)
+_MEASURED = re.compile("temp.*|press.*|.*druck|vib.*|rms|curr.*|strom|flow|leak.*|no|nr|id", re.I)
 _FAILURE = re.compile(
     "st(ö|oe)r|(?<!de)fault|fail|trip|alarm|error|fehler|defek|ausfall|crash|colli|not-?aus|emerg",
     re.IGNORECASE,
@@ -171,7 +170,7 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     if one_way and len(one_way) < len(steady):
         facts.append(("left out", f"{', '.join(one_way)}: never comes back, as an odometer"))
         steady = {n: ends for n, ends in steady.items() if n not in one_way}
-    if action := next((n for n in steady if _SET.search(" ".join(_WORDS.findall(n)))), ""):
+    if action := next(filter(_is_set, steady), ""):
         facts.append(("an action?", f"{action}, by its name; where nobody sets it: --action ''"))
     nobody = [f"{_named(n, _SIGNS)}=={x:.17g}" for n in steady if n != action for x in stand_ins[n]]
     options += [("--no-leader", " or ".join(nobody))] if nobody else []
@@ -364,6 +363,13 @@ def _round(number: float) -> float:
 def _named(name: str, signs: str) -> str:
     """A column's name as options take it, in double quotes where one of these is in it."""
     return quoted([name]) if set(name) & {*signs, '"'} else name
+
+
+def _is_set(name: str) -> bool:
+    """Whether a column is called as what somebody sets."""
+    words = _WORDS.findall(name)
+    may_be = any(map(_MAY_SET.fullmatch, words)) and not any(map(_MEASURED.fullmatch, words))
+    return bool(_ACTION.fullmatch(" ".join(words)) or any(map(_SET.fullmatch, words)) or may_be)
 
 
 def _stands(z: Floats) -> bool:

@@ -57,6 +57,7 @@ Tolerance = Annotated[
 ]
 TOLERANCE = 0.02  #: as `evofsm.guard.TOLERANCE`, without what that loads.
 BRAKES = 6.0  #: what a car's brakes are reckoned with where nobody said [m/s²]
+SUMO = (".sumocfg", ".sumo.cfg")  #: how names of configurations of SUMO end
 Brakes = Annotated[
     float,
     option("Hardest braking of the own car, that a guard reckons with [m/s²].", min=0.5, max=20.0),

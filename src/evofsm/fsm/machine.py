@@ -591,6 +591,7 @@ def _refuse(name: str, *_: object) -> None:
     raise AttributeError(f"{name} of a machine is read only: settings are given as it is made")
 
 
+# What a machine answers by name is read only; others cost nothing more to set.
 for _name in {*_ASKED, *_LIMITS, *Settings._fields}.difference(dir(EvolvingFSM)):
     _answer = methodcaller("__getattr__", _name)
     setattr(EvolvingFSM, _name, property(_answer, partial(_refuse, _name), doc=""))

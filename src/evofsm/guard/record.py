@@ -22,36 +22,42 @@ class Column(NamedTuple):
     in_table: bool = True  #: whether ``decisions.parquet`` has it
 
 
+def _of(part: str, name: str, kind: type[Any], about: str) -> Column:
+    return Column(kind, about, attrgetter(f"{part}.{name}"))
+
+
 _INTAKE = ", ".join(f"{flag.value} {flag.name}" for flag in Intake if flag.name)
 _PROPOSED = "what the controller wanted [m/s²]; left out where there is none"
 _STATE = "the most probable one, from 0; left out where none is known"
 
-_COLUMNS: Mapping[str, Any] = {
-    "time": ("situation", float, "since the start of the episode [s]"),
+#: By name in tables and in the audit log; MCAP's channel ``/risk`` drops ``risk_``.
+RECORD: Mapping[str, Column] = {
+    "time": _of("situation", "time", float, "since the start of the episode [s]"),
     "intake": Column(int, f"what was wrong: a sum of {_INTAKE}", lambda d: int(d.situation.intake)),
-    "state": ("situation", int, _STATE),
+    "state": _of("situation", "state", int, _STATE),
     "n_states": Column(
         int,
         "how many states there were",
         lambda d: 0 if d.situation.state is None else len(d.situation.belief),
     ),
-    "surprise": ("situation", float, "divergence of forecast and belief [bit]; left out at first"),
-    "proposed": ("revision", float, _PROPOSED),
-    "executed": ("revision", float, "what was commanded [m/s²]"),
-    "advised": ("revision", float, "what the reviser would have executed [m/s²]"),
-    "risk_proposed": ("revision", float, "probability of failure under the proposal"),
-    "risk_executed": ("revision", float, "the same for what is executed"),
+    "surprise": _of(
+        "situation", "surprise", float, "divergence of forecast and belief [bit]; left out at first"
+    ),
+    "proposed": _of("revision", "proposed", float, _PROPOSED),
+    "executed": _of("revision", "executed", float, "what was commanded [m/s²]"),
+    "advised": _of("revision", "advised", float, "what the reviser would have executed [m/s²]"),
+    "risk_proposed": _of(
+        "revision", "risk_proposed", float, "probability of failure under the proposal"
+    ),
+    "risk_executed": _of("revision", "risk_executed", float, "the same for what is executed"),
     "risk_low": Column(float, "lower end of its 90 % interval", lambda d: d.revision.interval[0]),
     "risk_high": Column(float, "upper end of its 90 % interval", lambda d: d.revision.interval[1]),
-    "evidence": ("revision", float, "disturbances that it rests on, such as braking leaders"),
-    "seen": ("revision", float, "time spent in states like this one before [s]"),
-    "reason": ("revision", str, "why, in a few words"),
-    "explanation": ("revision", str, "why, in detail; empty where nothing was said", False),
-}
-#: By name in tables and in the audit log; MCAP's channel ``/risk`` drops ``risk_``.
-RECORD: Mapping[str, Column] = {
-    name: of
-    if isinstance(of, Column)
-    else Column(of[1], of[2], attrgetter(f"{of[0]}.{name}"), in_table=of[3:] != (False,))
-    for name, of in _COLUMNS.items()
+    "evidence": _of(
+        "revision", "evidence", float, "disturbances that it rests on, such as braking leaders"
+    ),
+    "seen": _of("revision", "seen", float, "time spent in states like this one before [s]"),
+    "reason": _of("revision", "reason", str, "why, in a few words"),
+    "explanation": _of(
+        "revision", "explanation", str, "why, in detail; empty where nothing was said"
+    )._replace(in_table=False),
 }

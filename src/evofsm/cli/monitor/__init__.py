@@ -139,8 +139,9 @@ def monitor(
     elif not is_log and (system or "action" in reading):
         if traffic:
             raise ValueError("--traffic is of cars, and goes with no --observe or --action")
-        make, learn = partial(begun, system, reading, interval, tolerance, alarms), True
-        notice = f"a guard of {', '.join(make().variables)} learns from what comes"
+        new_guard = begun(system, reading, interval, tolerance, alarms)
+        make, learn = (lambda: new_guard), True
+        notice = f"a guard of {', '.join(new_guard.variables)} learns from what comes"
     rows, learnt_of = EPISODE, reader.pop("observe", None)
     observe = observe or learnt_of
     if episode is not None and is_number(episode) and not is_log:

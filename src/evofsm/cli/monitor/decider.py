@@ -193,7 +193,8 @@ class Decider:
         return self._of("error", time=time, about=about, error=what)
 
     def _of(self, kind: str, row: Row | None = None, **said: Any) -> Answer:
-        when = {"time": row.clock, **({"hours": row.hours} if row.hours else {})} if row else {}
+        when = {} if row is None else {"time": row.clock}
+        when |= {"hours": row.hours} if row and row.hours else {}
         return {"schema": messages.SCHEMA, "kind": kind, "n": self.n, **when, **said}
 
     def act(self, told: Taken) -> Answer:
@@ -245,8 +246,7 @@ class Decider:
         if not (isinstance(told, Row) and isinstance(latest, Row)):
             return ""
         if change := self.slots.change(told, latest):
-            if isinstance(self._before(told), Row) and "turns" not in self._said:
-                self._said.add("turns")
+            if isinstance(self._before(told), Row) and self._is_first("turns"):
                 _log.warning("%s; rows of several in turn need a monitor for each", change)
             return change
         step, hole = told.time - latest.time, self.slots.hole
@@ -318,9 +318,8 @@ class Decider:
             try:
                 revision = self._revision(row)
             except Exception as error:  # whatever a judge of somebody's own raises
-                if "failed" not in self._said:  # once, as it may fail at each row
+                if self._is_first("failed"):  # as it may fail at each row
                     _log.exception("the guard failed at %s s", row.time)
-                self._said.add("failed")
                 return self.error("guard", f"failed: {type(error).__name__}: {error}", row.clock)
             self.rows += 1
             self._alarm = self._is_alarm(revision)
@@ -354,18 +353,21 @@ class Decider:
         step = row.time - before.time if before and self.rows else interval
         if step > HOLE * interval:
             yield f"{step:.3g} s without a row: nothing is learnt or carried across"
-        if step < _OFTEN * interval and "often" not in self._said:
-            self._said.add("often")
+        if step < _OFTEN * interval and self._is_first("often"):
             text = f"the guard was made for {interval:g} s: --resample {interval:g}s"
             yield f"rows come every {step:.3g} s, but {text}"
-        if row.hours is None and row.time >= DATES and IN_UTC not in self._said:
-            self._said.add(IN_UTC)
+        if row.hours is None and row.time >= DATES and self._is_first(IN_UTC):
             yield IN_UTC
         variables = zip(self.form.variables, self._units, row.observation or (), strict=False)
         fast = [name for name, unit, z in variables if unit == "m/s" and abs(z or 0.0) > _FAST]
-        if fast and "fast" not in self._said:
-            self._said.add("fast")
+        if fast and self._is_first("fast"):
             yield f"{fast[0]} is above {_FAST:g} m/s: is that km/h?"
+
+    def _is_first(self, remark: str) -> bool:
+        """Whether it was not said yet; from now on it was."""
+        is_new = remark not in self._said
+        self._said.add(remark)
+        return is_new
 
     def _revision(self, row: Row) -> Revision:
         proposal: Any = 0 if self._is_alone else row.proposal

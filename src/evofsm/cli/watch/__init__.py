@@ -76,7 +76,7 @@ def watch(
             log_guard = None if guard is None else load_learning(guard, failed)
             try:
                 log_format = options.reading_of(**reader)
-                is_simulation = what.endswith((".sumocfg", ".sumo.cfg"))
+                is_simulation = what.endswith(options.SUMO)
                 show = session.watched_simulation if is_simulation else session.watched_log
                 run = show(what, log_format, risk, case, log_guard, brakes=brakes)
             except ValueError as error:
