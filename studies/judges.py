@@ -108,11 +108,14 @@ _GONE: dict[str, dict[str, Any]] = {
 }
 _SETTINGS = asdict(LearntSettings())
 _LEARNT = "evofsm.guard.learnt"
-# Private numbers of its modules.
+# Private numbers of its modules, and of the test whether the guard does harm. Those of `rollout`
+# are compiled into kernels.
+_PLACES = dict.fromkeys(("backups", "danger", "failure", "learn", "model", "motion"), _LEARNT)
+_PLACES |= {"harm": "evofsm.guard"}
 _NUMBERS = {
     f"{module}.{name}": value
-    for module in ("backups", "danger", "failure", "learn", "model", "motion")
-    for name, value in vars(resolve_name(f"{_LEARNT}.{module}")).items()
+    for module, place in _PLACES.items()
+    for name, value in vars(resolve_name(f"{place}.{module}")).items()
     if name.startswith("_") and type(value) in (int, float)
 }
 #: Each number of the learnt judge, halved and doubled; of what is near 1 how much it lacks.
@@ -230,7 +233,8 @@ def taken_out(parts: Sequence[str]) -> ExitStack:
     """Within it what has no switch is left out of the learnt judge, or is another number."""
     stack = ExitStack()
     for place, instead in _changes(parts, in_modules=True).items():
-        stack.enter_context(patch(f"{_LEARNT}.{place}", instead))
+        package = _PLACES[place.partition(".")[0]]
+        stack.enter_context(patch(f"{package}.{place}", instead))
     return stack
 
 

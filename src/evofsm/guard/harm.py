@@ -33,9 +33,11 @@ from evofsm.fsm.validation import Floats
 from evofsm.store import COUNT, Numbers
 
 # Episodes of each arm that are kept, the latest; what is left of the weight of one an episode
-# later, and where who drives may be another one by then; and the weights of those that ended well,
-# with which guarded and alone begin: who drives alone until the first refusal is known.
-_KEPT, _FADES, _HOPES = 20, (0.98, 0.9), (0.5, 0.25)
+# later, and where who drives may be another one by then.
+_KEPT, _FADE, _FADE_SOONER = 20, 0.98, 0.9
+# The weights of those that ended well, with which guarded and alone begin: who drives alone until
+# the first refusal is known.
+_HOPE, _HOPE_ALONE = 0.5, 0.25
 # So many episodes after the latest of the controller alone one is drawn, and then as often.
 _RARELY = 10
 # What it counts that of two episodes that failed one did so later.
@@ -162,14 +164,15 @@ class Harm(NamedTuple):
             random.gamma(
                 np.append(self._weights(arm[:-1], learning=True), hope), size=(draws, len(arm))
             )
-            for arm, hope in zip(arms, _HOPES, strict=True)
+            for arm, hope in zip(arms, (_HOPE, _HOPE_ALONE), strict=True)
         )
         won = np.einsum("ni,ij,nj->n", guarded, better(*arms), alone)
         return float((won >= 0.0).mean())
 
     def _weights(self, outcomes: Sequence[Outcome], *, learning: bool) -> Floats:
         is_open = self.ends or any(o.failed for o in self.guarded[-_RARELY:])
-        guarded, alone = _FADES[not learning], _FADES[learning and is_open]
+        guarded = _FADE if learning else _FADE_SOONER
+        alone = _FADE_SOONER if learning and is_open else _FADE
         fades = [guarded if o.guarded else alone for o in outcomes]
         return np.power(fades, [self.n_episodes - o.episode for o in outcomes])
 
@@ -185,11 +188,11 @@ class Harm(NamedTuple):
             return "" if self.helps(learning=False) else "was not shown to help"
         if self.is_on_trial:
             return "shadow"
-        if _all_failed(self.guarded):
+        if _all_failed(self.guarded, _CAREFUL):
             turn_is_over = all(outcome.guarded for outcome in self.outcomes[-_TURN:])
             if turn_is_over or not _all_failed(self.alone(), 1):
                 return "shadow"
-            if _all_failed(self.alone()) and len(self.guarded) < _TRIES:
+            if _all_failed(self.alone(), _CAREFUL) and len(self.guarded) < _TRIES:
                 return ""
         fails = any(outcome.failed for outcome in self.outcomes[-1:])
         is_due = fails or (self._replaces_most and self._is_new) or self._long_ago
@@ -215,7 +218,7 @@ class Harm(NamedTuple):
     @property
     def _draws(self) -> int:
         """The guard drives if it does in one of so many draws."""
-        is_bold = self._is_new or self._long_ago or _all_failed(self.guarded)
+        is_bold = self._is_new or self._long_ago or _all_failed(self.guarded, _CAREFUL)
         return 1 if is_bold else _CAREFUL
 
     def told(self, *, learning: bool) -> str:
@@ -313,7 +316,7 @@ def better(some: Sequence[Outcome], others: Sequence[Outcome]) -> Floats:
     return np.where(fails, np.where(failed, _SOONER, 1.0) * (best.astype(float) - worse), neither)
 
 
-def _all_failed(outcomes: Sequence[Outcome], latest: int = _CAREFUL) -> bool:
+def _all_failed(outcomes: Sequence[Outcome], latest: int) -> bool:
     """Whether there are so many, and the latest of them failed."""
     return len(outcomes) >= latest and all(outcome.failed for outcome in outcomes[-latest:])
 
