@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
 from evofsm import EvolvingFSM, FSMModel, Novelty, register_rule
 from evofsm.fsm.explanation import Tally
-from evofsm.fsm.proportions import FailureRecord, poisson_bounds
+from evofsm.fsm.proportions import FailureRecord, binomial_bounds, poisson_bounds
 
 COUNTS = ("episodes", "failed_soon", "tried", "failed_after")
 
@@ -146,7 +147,7 @@ def test_failures_that_were_told_and_never_happened_are_counted_as_none(tell, tm
     machine = untold()
     assert not machine.failures_told
     tell(machine)
-    assert "0 of 3 (at most 48 %) failed later on" in machine.model().explain(0).text
+    assert "0 of 3 (at most 64 %) failed later on" in machine.model().explain(0).text
     machine.save(tmp_path / "machine")
     machine.model().save(tmp_path / "model")
     assert EvolvingFSM.load(tmp_path / "machine").failures_told
@@ -207,7 +208,24 @@ def test_what_came_after_an_action_is_part_of_what_came_here():
         machine.act(1)
         machine.observe([10.0, 0.0], failed=True)
     text = machine.model().explain(0, action=1).text
-    assert "0 of 1 (at most 74 %) failed later on; none of them is known to have tried a(2)" in text
+    assert "0 of 1 (at most 95 %) failed later on; none of them is known to have tried a(2)" in text
+
+
+@pytest.mark.parametrize("horizon", [None, 2])
+@pytest.mark.parametrize("blind", [1, 6])
+def test_who_fails_after_a_sensor_fell_silent_has_failed(horizon, blind):
+    """Of the latest observations, that of the failure too, one variable was not seen."""
+    machine = EvolvingFSM(2, rule=Novelty(radius=1.0), failure_horizon=horizon)
+    for _ in range(8):
+        machine.start_episode()
+        machine.learn_one([0.0, 0.0], 1)
+        for k in range(blind):
+            machine.observe([0.0, np.nan], partial=True, failed=k == blind - 1)
+            if k < blind - 1:
+                machine.act(1)
+    model = machine.model()
+    assert "8 of 8 (at least 68 %) after a(2)" in model.explain(0, action=1).text
+    assert (model.failures[1, 0], model.decisions[1, 0]) == (8.0, 8.0 * blind)
 
 
 # -- How often something begins, and how well that is known ----------------------------------------
@@ -219,6 +237,16 @@ def test_what_came_after_an_action_is_part_of_what_came_here():
 )
 def test_intervals_of_counts_are_those_of_the_tables(count, low, high):
     np.testing.assert_allclose(poisson_bounds(count), (low, high), rtol=1e-3, atol=1e-9)
+
+
+@pytest.mark.parametrize(("count", "of"), [(0, 1), (1, 3), (5, 5), (7, 10), (19, 4000), (30, 60)])
+def test_intervals_of_shares_are_quantiles_of_a_beta_distribution(count, of):
+    exact = stats.beta.ppf([0.05, 0.95], [count, count + 1], [of - count + 1, of - count])
+    np.testing.assert_allclose(
+        binomial_bounds(count, of),
+        np.nan_to_num(exact, nan=count / of),
+        atol=1e-9 if count < 20 else 0.011,
+    )
 
 
 def test_failures_are_told_with_what_they_rest_on():

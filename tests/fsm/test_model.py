@@ -10,7 +10,7 @@ from evofsm.fsm.arrays import OF_ACTIONS, SUMS
 ACTIONS = IntervalActions(low=-1.0, high=1.0, width=1.0)
 
 
-def chain(*matrices, uses=None):
+def chain(*matrices, decisions=0.0):
     """A model with the given transition matrices; the rest is of no account."""
     q, n = len(matrices), len(matrices[0])
     return FSMModel(
@@ -19,11 +19,12 @@ def chain(*matrices, uses=None):
         width=1.0,
         transition_matrices=np.array(matrices),
         origin_frequency=np.ones((q, n)),
-        uses=np.ones(q) if uses is None else np.array(uses),
+        uses=np.ones(q),
         created=np.arange(1.0, n + 1),
         changes=np.zeros((n, n)),
         **{name: np.zeros(n) for name in (*SUMS, "joined")},
-        **{name: np.zeros((q, n)) for name in OF_ACTIONS},
+        **{name: np.zeros((q, n)) for name in OF_ACTIONS if name != "decisions"},
+        decisions=np.zeros((q, n)) + decisions,
     )
 
 
@@ -120,7 +121,7 @@ def test_at_the_start_of_an_episode_the_forecast_comes_from_the_uniform_belief(m
 
 
 def test_without_an_action_all_count_alike_from_the_first_step_on():
-    model = chain(SWITCH, STAY, uses=[3.0, 1.0])
+    model = chain(SWITCH, STAY, decisions=[[3.0, 3.0], [1.0, 1.0]])
     np.testing.assert_allclose(model.propagate([1.0, 0.0]), [0.95, 0.05])
     np.testing.assert_allclose([1.0, 0.0] @ model.averaged_matrix, [0.925, 0.075])
 

@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from evofsm import EvolvingFSM, IntervalActions
+from evofsm import EvolvingFSM, IntervalActions, Novelty
 from evofsm.io import to_dot, to_prism
 
 ODD = 'v "\\#1;<b>&`x`{|}'
@@ -133,6 +133,28 @@ def test_commands_are_distributions_and_stand_for_what_was_tried(model):
     assert (labels["failed"], labels["state_2"]) == ("s=0", "s=2")
     for state in range(model.n_states + 1):  # PRISM refuses a state without a command
         assert any(s == state for s, _ in commands)
+
+
+@pytest.mark.parametrize("least", [0.0, 0.01])
+def test_what_is_new_takes_nothing_from_what_was_seen_long_ago(least):
+    """The paper's equations make it nearly certain to follow where it was not for long."""
+    machine = EvolvingFSM(2, rule=Novelty(radius=1.0))
+    for _ in range(20):
+        machine.learn_many([[0.0], [10.0]], [0, 0], [0])
+        machine.fail()
+    machine.learn_many([[20.0], [30.0]] * 1000 + [[60.0]] * 9, [0] * 2009, [0])
+    model = machine.model()
+    assert model.transition_matrices[0, 0, -1] > 0.9
+    _, commands, _ = parsed(to_prism(model, least=least))
+    assert commands[1, "a1"][2] > 0.94
+
+
+def test_an_edge_is_of_the_actions_that_were_taken_there():
+    machine = EvolvingFSM(2, rule=Novelty(radius=1.0))
+    machine.learn_many([[0.0], [10.0]] * 200 + [[20.0]] * 400, [0] * 400 + [1] * 400)
+    assert "0.998 (200)" in next(
+        row for row in to_dot(machine.model()).splitlines() if "s1 ->" in row
+    )
 
 
 def test_rare_transitions_can_be_left_out_but_failure_never_is(model):

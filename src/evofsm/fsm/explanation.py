@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evofsm.fsm.naming import Labels
-from evofsm.fsm.proportions import bounds_text, wilson_bounds
+from evofsm.fsm.proportions import binomial_bounds, bounds_text
 from evofsm.fsm.validation import Floats, counted, state_name
 
 # A belief above this is not worth a word.
@@ -46,20 +46,16 @@ class Tally(NamedTuple):
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Of the share, 90 % (Wilson 1927); from 0 to 1 without any, or where it is not known."""
-        if not (self.episodes and self.is_told):
-            return 0.0, 1.0
-        return wilson_bounds(self.share, float(self.episodes))
+        """Of the share, 90 %; from 0 to 1 without any, or where it is not known."""
+        is_known = self.episodes and self.is_told
+        return binomial_bounds(self.failed, self.episodes) if is_known else (0.0, 1.0)
 
     def __str__(self) -> str:
         if not self.is_told:
             return f"an unknown number of {self.episodes:,}"
         if not (self.episodes and self.is_exact):
             return f"{self.failed:,} of {self.episodes:,}"
-        low, high = self.interval
-        low = low if self.failed else 0.0
-        high = high if self.failed < self.episodes else 1.0
-        return f"{self.failed:,} of {self.episodes:,} ({bounds_text(low, high)})"
+        return f"{self.failed:,} of {self.episodes:,} ({bounds_text(*self.interval)})"
 
 
 class Explanation(NamedTuple):

@@ -166,7 +166,8 @@ class EvolvingFSM(Retraced):
             an episode. Without it nothing is said of failures: see `failures_told`.
         partial : bool
             Whether entries may be NaN or masked: that they were not observed. It is then recognised
-            by the others, no state moves, and no transition to it is learnt.
+            by the others, no state moves, and no transition to it is learnt; the action before it
+            is counted, and the state as visited where the episode came to it before.
 
         Raises
         ------
@@ -269,7 +270,7 @@ class EvolvingFSM(Retraced):
         if not self._learnt.now["chained"][0]:
             raise ValueError("fail before observe: this episode has no observation to fail after")
         self._make_room()
-        stepping.fail(self._learnt, self._settings)
+        stepping.believe(self._learnt, self._settings, np.empty(0), failed=True)
 
     @alone
     @step
@@ -558,9 +559,7 @@ class EvolvingFSM(Retraced):
         surprise = np.nan if absent.all() or not len(forecast) else jensen_shannon(forecast, belief)
         # In a copy, which takes the place of what there was as a whole.
         learnt = arrays.resized(self._learnt, *room_for(self._learnt, self._settings))
-        stepping.believe(learnt, belief)
-        if failed:
-            stepping.fail(learnt, self._settings)
+        stepping.believe(learnt, self._settings, belief, failed=bool(failed))
         if failed is not None:
             learnt.now["failures_told"] = 1
         self._learnt = learnt

@@ -158,10 +158,13 @@ class FSMModel:
 
     @property
     def averaged_matrix(self) -> Floats:
-        """(n, n) transition probabilities, each action counted as often as it was used."""
-        if not self.uses.any():
-            return self.marginal_matrix
-        return np.asarray(np.tensordot(self.uses / self.uses.sum(), self.transition_matrices, 1))
+        """(n, n) transition probabilities, each action counted as often as it was taken there.
+
+        Where none was, it is `marginal_matrix`.
+        """
+        weights = np.where(self.decisions.any(axis=0), self.decisions, 1.0)
+        weights /= weights.sum(axis=0)
+        return np.asarray(np.einsum("qi,qij->ij", weights, self.transition_matrices))
 
     def explain(
         self,
@@ -190,7 +193,7 @@ class FSMModel:
         >>> model = machine.model(names=["gap"], units=["m"], dt=0.1)
         >>> print(model.explain([0.2, 0.8], action=1))
         #2: gap 1 m (belief 80 %, next #1 20 %). 1 episode came here (1 observation);
-        1 of 1 (at least 26 %) failed later on; none of them is known to have tried a(2) here.
+        1 of 1 (at least 5 %) failed later on; none of them is known to have tried a(2) here.
         Most often reached from #1: 1 of 1 times.
         >>> print(model.explain(observation=[30.0]))
         Never seen, as far as the states tell: 29 from the nearest, #2 (gap 1 m), where a state

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import cache
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -15,8 +15,9 @@ from evofsm.fsm.validation import counted
 
 # Two-sided 90 %.
 _QUANTILE = 1.645
-# From so many events on their distribution is taken to be a power of a normal one.
-_MANY_EVENTS = 50
+# From so many events on their distribution is taken to be a power of a normal one, and from so
+# many cases of each kind on Wilson's interval is near enough.
+_MANY_EVENTS, _MANY_CASES = 50, 20
 
 
 @compiled
@@ -36,7 +37,34 @@ def wilson_bounds(share: float, count: float, quantile: float = _QUANTILE) -> tu
     return max(centre - reach, 0.0), min(centre + reach, 1.0)
 
 
-@cache
+@lru_cache(maxsize=1024)
+def binomial_bounds(count: int, of: int) -> tuple[float, float]:
+    """90 % interval of a share where ``count`` ``of`` so many were seen (Clopper & Pearson 1934).
+
+    Each end by itself holds with 95 %.
+
+    >>> binomial_bounds(0, 3), binomial_bounds(3, 3)
+    ((0.0, 0.6315968501359613), (0.36840314986403866, 1.0))
+    """
+    if 2 * count > of:
+        low, high = binomial_bounds(of - count, of)
+        return 1.0 - high, 1.0 - low
+    if count >= _MANY_CASES:
+        return wilson_bounds(count / of, of)
+    return _share(count - 1, of, 0.95) if count else 0.0, _share(count, of, 0.05)
+
+
+def _share(most: int, of: int, chance: float) -> float:
+    """The chance of each of so many cases of which at most ``most`` happen with that chance."""
+    low, high = 0.0, 1.0
+    for _ in range(60):
+        share = 0.5 * (low + high)
+        terms = (math.comb(of, k) * share**k * (1.0 - share) ** (of - k) for k in range(most + 1))
+        low, high = (share, high) if sum(terms) > chance else (low, share)
+    return high
+
+
+@lru_cache(maxsize=1024)
 def poisson_bounds(count: int) -> tuple[float, float]:
     """90 % interval of the expected number of events where ``count`` were seen (Garwood 1936)."""
     return _mean(count - 1, 0.95) if count else 0.0, _mean(count, 0.05)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from evofsm.fsm.arrays import ENDINGS, EPISODES, FAILED_SOON, NO_ACTION, VISITS, Learnt, Settings
 from evofsm.fsm.clusters import CREATED, MERGED, MOVED, UNCHANGED, determine, recognise, width_of
 from evofsm.fsm.divergence import jensen_shannon_kernel
-from evofsm.fsm.kernels import inner_kernel, kernel, lanes, rare_kernel, spliced_kernel, uncompiled
+from evofsm.fsm.kernels import inner_kernel, kernel, lanes, rare_kernel, spliced_kernel
 from evofsm.fsm.transitions import expand, forecast_and_identify, merge_closest, place_of, room_for
 from evofsm.fsm.validation import Floats
 
@@ -100,22 +100,26 @@ def learn_rows(
 
 
 @kernel
-def fail(learnt: Learnt, settings: Settings) -> None:
-    """End the episode in failure, to which the pending action led; there is room for its matrix."""
+def believe(learnt: Learnt, settings: Settings, belief: Floats, failed: bool) -> None:
+    """Go on with a belief over all states, or end without any where it is empty.
+
+    It teaches no state, and no transition to one. The action before it was taken; and the state is
+    visited, if the episode came to it before. Where the episode ``failed`` it ends in failure.
+    There must be room for the action's matrix.
+    """
     now = learnt.now[0]
-    is_pending = now.action != NO_ACTION  # a variable: with True itself it would be compiled again
-    if is_pending:
+    if now.action != NO_ACTION:
         place = place_of(learnt, now.action, settings.prior_frequency)
-        _count_decision(learnt, place, now.n_states, is_pending)
-    _end(learnt, settings)
-
-
-def believe(learnt: Learnt, belief: Floats) -> None:
-    """Go on in the episode with a belief over all states, from which nothing else is learnt."""
-    now: Any = learnt.now.view(np.recarray)[0]
-    uncompiled(_tick)(now)
-    learnt.belief[: len(belief)] = belief
-    now.state, now.action, now.chained = belief.argmax(), NO_ACTION, 1
+        _count_decision(learnt, place, now.n_states, failed)
+    if len(belief) > 0:
+        _tick(now)
+        for i in range(now.n_states):
+            learnt.belief[i] = belief[i]
+        now.state, now.action, now.chained = np.argmax(belief), NO_ACTION, 1
+        there = learnt.states[now.state]
+        there.latest_visit = now.clock if there.latest_visit >= now.began else there.latest_visit
+    if failed:
+        _end(learnt, settings)
 
 
 @rare_kernel

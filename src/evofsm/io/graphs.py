@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import in_a_line
@@ -26,6 +27,8 @@ _DOT_HEAD = """digraph evofsm {
 _LARGEST_NODE, _WIDEST_LINE = 1.2, 3.0
 # Probabilities of a process have so many decimals; those of a command add up to 1 exactly.
 _DECIMALS = 12
+# A smaller share of what followed a state is not taken for seen.
+_STRAY = 1e-3
 _PROBABILITY = Numbers(least=0.0, most=1.0)
 
 
@@ -162,11 +165,13 @@ def to_prism(model: FSMModel, evidence: float = 1.0, least: float = 0.0) -> str:
             "told its actions?)"
         )
     body, unknown = list[str](), list[int]()
+    arrivals = model.changes @ model.recognise(model.centers)  # and what is believed beside it
     for state in range(n):
         about = [f"#{state + 1}", *(_where(model, state) if model.names else [])]
         body += ["", f"  // {', '.join([*about, counted(round(model.visits[state]), 'visit')])}"]
         actions = np.flatnonzero(model.decisions[:, state] >= evidence).tolist()
-        body += [line for action in actions for line in _command(model, state, action, least)]
+        where = state, arrivals[state] > _STRAY * model.changes[state].sum()
+        body += [line for action in actions for line in _command(model, *where, action, least)]
         if not actions:
             unknown.append(state + 1)
             body[-1] += ": no action has the evidence"
@@ -204,9 +209,14 @@ def _header(model: FSMModel, evidence: float, least: float, unknown: int) -> Ite
     yield ""
 
 
-def _command(model: FSMModel, state: int, action: int, least: float) -> Iterator[str]:
+def _command(
+    model: FSMModel, state: int, was_seen: NDArray[np.bool_], action: int, least: float
+) -> Iterator[str]:
     decisions, failures = model.decisions[action, state], model.failures[action, state]
     row = model.transition_matrices[action, state]
+    if 0.0 < (support := row[was_seen].sum()) < (most := decisions / (1.0 + decisions)):
+        # Where it was not for long, what is new is nearly certain to follow, by the prior alone.
+        row = row * np.where(was_seen, most / support, (1.0 - most) / (1.0 - support))
     row = np.where(row >= min(least, row.max()), row, 0.0)
     share = failures / decisions
     chances = np.concatenate([[share], (1.0 - share) * row / row.sum()])

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evofsm.fsm.validation import state_name
 from evofsm.paper.runs import PaperStudy, Run
@@ -45,9 +46,8 @@ def _of_collisions(study: PaperStudy) -> Iterator[Claim]:
         f"{study.settings.safe_until:g} s",
         as_in_paper == len(study.runs) and study.is_safe_at_the_end,
     )
-    decel = study.settings.scenario.leader.brake_decel
     for time, run in zip(study.settings.brake_at, study.extra_runs, strict=True):
-        at_brake = run.state[run.episode.leader_accelerations == -decel][:1].tolist()
+        at_brake = run.state[_brakes(study, run)][:1].tolist()
         outcome = "the leader did not brake"
         if at_brake:
             end = f"collision at {run.episode.time[-1]:.1f} s, in {state_name(run.state[-1])}"
@@ -125,7 +125,15 @@ def _change(study: PaperStudy, case: int, *, leaves: bool) -> tuple[str, bool]:
     text = f"{state_name(run.state[row])} at {switch:g} s"
     if change_row > row:
         text += f", {state_name(run.state[change_row])} from {run.episode.time[change_row]:.1f} s"
+        if len(rows := _brakes(study, run, change_row)):
+            text += f", after the leader's full brake at {run.episode.time[rows[0]]:.1f} s"
     return f"{text}; so in {as_in_paper} of {len(runs)} rounds", as_in_paper == len(runs)
+
+
+def _brakes(study: PaperStudy, run: Run, end: int | None = None) -> NDArray[np.intp]:
+    """Rows before an end at which the leader brakes in full."""
+    decel = study.settings.scenario.leader.brake_decel
+    return np.flatnonzero(run.episode.leader_accelerations[:end] == -decel)
 
 
 def _outcome(run: Run) -> str:
