@@ -138,6 +138,19 @@ def test_braking_that_would_be_hit_from_behind_is_as_risky():
     assert not judge().judge(at(scene(behind(60.0, 15.0))), ACTIONS).risk.any()
 
 
+@pytest.mark.parametrize("gap", [5.0, 0.4, -0.1])
+def test_proposed_braking_is_not_softened_for_who_is_behind(gap):
+    revision = decide(scene(behind(gap, 15.0)), -4.0)
+    assert (revision.executed, revision.risk_proposed) == (-4.0, 1.0)
+    assert "object 1, behind, survives no braking harder than" in revision.reason
+    assert "the proposed braking is kept" in revision.reason
+    one = Object("ahead", 14.0, 0.0, 15.0, ax=-4.0)
+    assert decide(scene(one, behind(gap, 15.0)), -2.0).executed <= -2.0
+    standing = Scene(SLOWER._replace(vx=0.0), [behind(gap + 5.0, 8.0)]).rows(most=1)
+    revision = decide(standing, -3.0)
+    assert (revision.executed, revision.risk_proposed) == (-3.0, 0.0)
+
+
 def test_a_gap_that_is_not_safe_is_regained_in_proportion():
     cut_in = [decide(scene(ahead(5.0, v)), 0.0).executed for v in (22.0, 15.0, 10.0, 7.0)]
     assert cut_in[0] == 0.0  # it opens the gap again by itself

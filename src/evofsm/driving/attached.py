@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evofsm.driving.judge import REGAIN, SLIGHT, LatentRisk
+from evofsm.driving.judge import REGAIN, SLIGHT, STANDS, LatentRisk
 from evofsm.driving.leaders import BrakeWatch, Manoeuvres
 from evofsm.driving.measures import deceleration_to_avoid_collision, time_to_collision
 from evofsm.driving.naming import VARIABLES
@@ -68,8 +68,8 @@ _CAR_WIDTH = 1.8
 _NEAREST, _MARGIN = 0.01, 0.1
 # Limits are as coarse as that [m/s²], and so far a driver may want more.
 _COARSE = 0.3
-# Slower than this a car stands, and a speed that differs by no more is the same [m/s].
-_STANDS, _SAME_SPEED = 0.1, 1e-6
+# A speed that differs by no more is the same [m/s].
+_SAME_SPEED = 1e-6
 # SUMO's speed mode where a guard acts: no faster than safe, nor than the car can accelerate (bits 0
 # and 1), but braking as hard as it has to (bit 2). Red lights and right of way stay as they were.
 _ON, _OFF = 0b011, 0b100
@@ -418,7 +418,7 @@ class Guarding:
             desired_speed = max(car.wish, speed)
         wish, acceleration = ((v - car.speed) / self._seeing.dt for v in (desired_speed, speed))
         revision = car.revision or self._decide(car, wish)  # where it acts, that was decided before
-        stands = max(car.speed, speed, desired_speed) < _STANDS
+        stands = max(car.speed, speed, desired_speed) < STANDS
         outcome = acceleration if self._acts else float(revision.advised)
         self.revised += not stands and outcome < wish - SLIGHT
         if self._report is not None:

@@ -50,8 +50,8 @@ if TYPE_CHECKING:
 COMFORT, REGAIN = 3.0, 1.0
 #: An acceleration that differs by no more is the same to whoever drives [m/s²].
 SLIGHT = 0.1
-# Slower than this a car stands, though a sensor may show that it moves [m/s].
-_STANDS = 0.1
+#: Slower than this a car stands, though a sensor may show that it moves [m/s].
+STANDS = 0.1
 # Where a situation is not sure, it may be worse by so many standard deviations.
 _CAUTION = 2.5
 # Nearly no gap [m]: smaller than any that counts as no collision for who moves.
@@ -381,7 +381,7 @@ class LatentRisk(Retraced, LearningJudge):
         constants = {
             **{"DECEL": self.brakes.decel, "LAG": self.brakes.lag, "LIKELY": self.brakes._likely},
             **{"KNOWN": self.brakes.known, "LOWEST": self.lowest, "CLEARANCE": self.margin},
-            **{"HARDEST": HARDEST, "HALVINGS": rehearsal._HALVINGS, "STANDS": _STANDS},
+            **{"HARDEST": HARDEST, "HALVINGS": rehearsal._HALVINGS, "STANDS": STANDS},
             **{"COMFORT": self.comfort, "REGAIN": self.regain, "TOUCHING": rehearsal._TOUCHING},
             "WORST": self.manoeuvres.exceeded_by(reviser.tolerance),
             **{"ANOTHER_GAP": leaders._ANOTHER_GAP, "ANOTHER_SPEED": leaders._ANOTHER_SPEED},
@@ -434,7 +434,7 @@ class LatentRisk(Retraced, LearningJudge):
 
 def effective(speed: float, actions: Floats) -> Floats:
     """(k,) what accelerations come to at a speed [m/s], the first of which is the proposal."""
-    return np.maximum(actions, min(float(actions[0]), 0.0)) if speed < _STANDS else actions
+    return np.maximum(actions, min(float(actions[0]), 0.0)) if speed < STANDS else actions
 
 
 def in_proportion(

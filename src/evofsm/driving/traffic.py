@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from evofsm.driving.judge import LatentRisk, effective, in_proportion
+from evofsm.driving.judge import STANDS, LatentRisk, effective, in_proportion
 from evofsm.driving.naming import REVERSE, SPEEDS
 from evofsm.driving.rehearsal import ONCOMING
 from evofsm.fsm.actions import IntervalActions
@@ -177,6 +177,9 @@ class TrafficRisk(ActionJudge):
 
     Notes
     -----
+    Who is behind limits what the guard adds, never braking that is proposed: that may be for what
+    no object tells of, such as a red light. It is said to be risky, and kept.
+
     Chosen is the action in proportion (`LatentRisk.choose`) that the car behind survives. Where
     none avoids a collision that is foreseen, it is the least risky ahead of those that the car
     behind survives; where a leader who goes on as it does, at its speed or braking, would be hit
@@ -235,7 +238,8 @@ class TrafficRisk(ActionJudge):
 
     def _survived(self, pairs: Sequence[Pair]) -> tuple[float, Pair | None]:
         """The hardest braking of oneself that all behind survive [m/s²], and who survives least."""
-        behind = [p for p in pairs if p.role is Role.BEHIND and not math.isnan(p.v_leader)]
+        # The braking of who stands is hit by nobody.
+        behind = [p for p in pairs if p.role is Role.BEHIND and p.v_leader >= STANDS]
         limits = [float(self._behind.critical(pair.observation, _COASTING)[0]) for pair in behind]
         return min(zip(limits, behind, strict=True), key=itemgetter(0), default=(math.inf, None))
 
@@ -250,6 +254,12 @@ class TrafficRisk(ActionJudge):
         avoids, regains = np.ones((2, len(options)), np.bool_)
         pairs = pairs_of(situation.observation)
         ahead = [pair for pair in pairs if pair.role is not Role.BEHIND]
+        # No harder than who is behind survives, but never softer than what is proposed.
+        bearable = options >= min(-self._survived(pairs)[0], options[0])
+        # Without the risk from behind of what is bearable.
+        risk = np.where(bearable, self.ahead.manoeuvres.harder(judged.critical), 1.0)
+        if risk[0] <= tolerances[0]:
+            return 0, "the proposed braking is kept: it may be for what is not seen"
         for pair in ahead:
             pair_arguments = pair[2:5], pair.braking, options, tolerances[-1]
             two = self.ahead._foreseen(*pair_arguments, hardest=-float(options.min()))
@@ -257,8 +267,7 @@ class TrafficRisk(ActionJudge):
                 return None  # who goes on so is hit, however one brakes
             avoids, regains = avoids & two[0], regains & two[1]
         avoids &= options <= options[0]
-        bearable = options >= -self._survived(pairs)[0]
-        arguments = options, judged.risk, tolerances, self.ahead.comfort, avoids & bearable, regains
+        arguments = options, risk, tolerances, self.ahead.comfort, avoids & bearable, regains
         if (choice := in_proportion(*arguments)) is not None:
             return choice
         braking = max((pair.braking for pair in ahead), default=0.0)
