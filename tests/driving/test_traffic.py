@@ -32,6 +32,8 @@ ACTIONS = np.array([2.5, 0.0, -4.5, -9.0])
             (Role.CROSSING, 1, 17.2, 20.0, 0.0),
         ),
         (Object("h", 80.0, -6.0, 0.0, vy=4.0), None),  # crosses behind
+        (Object("j", 99.5, 3.5, 20.0, vy=-1.0), None),  # is beside, and comes closer
+        (Object("k", 90.0, 3.5, 25.0, vy=-1.0), None),  # will be behind
     ],
 )
 def test_whom_one_may_meet_is_a_pair(other, pair):

@@ -131,8 +131,9 @@ def pairs_of(rows: ArrayLike) -> list[Pair]:
     """With whom one may meet, the closest first, from a scene's `Scene.rows`.
 
     An object is in one's lane where their sides overlap; it cuts in, or crosses if it moves across
-    more than along the road, where they will within 2 s. Rows without a place or speed (NaN) are
-    left out; sizes that are not seen are usual ones, an acceleration 0.
+    more than along the road, where they will within 2 s. Who is behind counts in the lane
+    alone. Rows without a place or speed (NaN) are left out; sizes that are not seen are usual ones,
+    an acceleration 0.
     """
     flat = real_array("rows", rows, 1)
     if len(flat) % len(COLUMNS):
@@ -157,8 +158,8 @@ def _pair(ego: list[float], obj: list[float], index: int) -> Pair | None:
         return None
     gap = abs(apart) - 0.5 * (ego[5] + along)
     if apart < 0.0:
-        # Who moves across behind is none of one's business.
-        return None if crosses else Pair(Role.BEHIND, index, gap, vx, ego[3])
+        # Who moves across behind, or is not in the lane (yet), is none of one's business.
+        return None if crosses or free >= 0.0 else Pair(Role.BEHIND, index, gap, vx, ego[3])
     role = (Role.ONCOMING if vx < ONCOMING else Role.AHEAD) if free < 0.0 else Role.CUTTING_IN
     braking = max(-ax, 0.0) if vx > 0.0 else 0.0
     return Pair(Role.CROSSING if crosses else role, index, gap, ego[3], vx, braking)
