@@ -53,7 +53,7 @@ class Object(NamedTuple):
     y: float  #: of its centre, to the left [m]
     vx: float  #: [m/s]
     vy: float = 0.0  #: [m/s]
-    length: float = 5.0  #: along its heading [m]
+    length: float = 5.0  #: along its heading; of who stands, up to 1 m/s, along the road [m]
     width: float = 1.8  #: [m]
     ax: float = 0.0  #: [m/s²]
 
@@ -147,10 +147,15 @@ def pairs_of(rows: ArrayLike) -> list[Pair]:
     return sorted(filter(None, pairs), key=lambda pair: pair.gap)
 
 
+def lies_across(vx: float, vy: float) -> bool | None:
+    """Whether who moves so lies across the road; None where it stands, as far as a sensor tells."""
+    return abs(vy) > abs(vx) if max(abs(vx), abs(vy)) > -ONCOMING else None
+
+
 def _pair(ego: list[float], obj: list[float], index: int) -> Pair | None:
     _, x, y, vx, vy, length, width, ax = obj
     apart, aside = x - ego[1], y - ego[2]
-    crosses = abs(vy) > abs(vx)
+    crosses = lies_across(vx, vy)
     along, across = (width, length) if crosses else (length, width)
     free = abs(aside) - 0.5 * (ego[6] + across)  # between the sides
     closing_speed = (ego[4] - vy) * math.copysign(1.0, aside)

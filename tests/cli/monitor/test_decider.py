@@ -271,6 +271,24 @@ def test_a_reviser_without_risks_alarms_where_it_differs():
     assert (answer["alarm"], answer["mode"], answer["risk_proposed"]) == (True, "act", None)
 
 
+def test_in_traffic_who_came_across_the_lane_and_stands_there_still_lies_across():
+    decider = Decider(guard_of_monitor(0.1, 6.0, traffic=True))
+    ego = {"x": 0.0, "y": 0.0, "vx": 15.0, "length": 5.0}
+    lorry = {"id": "lorry", "x": 20.0, "y": 5.0, "length": 12.0, "width": 2.5}
+
+    def seen(k, vx, vy):
+        told = {"time": 0.1 * k, "ego": ego, "objects": [lorry | {"vx": vx, "vy": vy}]}
+        answer = decider.answer(json.dumps({"proposal": 0.5, **told}).encode())
+        return answer["role"], answer["risk_proposed"]
+
+    speeds = [(0.0, -4.0), (0.0, -0.3), (0.0, 0.0), (5.0, 0.0), (0.0, 0.0), (0.0, -4.0)]
+    found = [seen(k, *speed) for k, speed in enumerate(speeds)]
+    across, free = [("crossing", 1.0), ("ahead", 1.0), ("ahead", 1.0)], [(None, 0.0)] * 2
+    assert found == [*across, *free, across[0]]
+    decider.answer(b'{"end": true, "failed": false}')
+    assert seen(9, 0.0, 0.0) == (None, 0.0)  # another lorry, perhaps
+
+
 def test_in_traffic_the_worst_object_is_named_and_who_is_behind_counts():
     decider = Decider(guard_of_monitor(0.1, 6.0, traffic=True))
     ego = {"x": 0.0, "y": 0.0, "vx": 14.0, "length": 5.0}

@@ -25,7 +25,7 @@ from evofsm.cli.show import plain
 from evofsm.driving import Object, Scene
 from evofsm.driving.judge import SLIGHT, LatentRisk
 from evofsm.driving.naming import VARIABLES
-from evofsm.driving.traffic import COLUMNS, RATES, TrafficRisk
+from evofsm.driving.traffic import COLUMNS, RATES, TrafficRisk, lies_across
 from evofsm.fsm import EvolvingFSM
 from evofsm.fsm.validation import probability
 from evofsm.guard import ActionReviser, BoxActions, Choices, Foresight, Guard, LearntRisk, Mode
@@ -43,6 +43,7 @@ _FAST = 60.0  # nothing on a road is faster [m/s]
 _LATE = 1.0  # what is older by less is late, by more from a sender that began anew [s]
 HOLE, _OFTEN = 1.5, 0.5  #: a gap in time, and rows that come too often, in intervals
 _AX, _VX, _VY, _Y = map(COLUMNS.index, ("ax", "vx", "vy", "y"))
+_SIDES = [COLUMNS.index(name) for name in ("length", "width")]
 # A rate, of what it is, which less is noise, and more a leap, and over how long it is told [s]: a
 # speed across from scene to scene would be noise.
 _LATELY = 0.5
@@ -70,6 +71,7 @@ class Decider:
         self._recent: deque[tuple[Message, Answer]] = deque(maxlen=_RECENT)
         self._next: int | None = None  # of the recent ones, where they are being sent again
         self._said: set[str] = set()  # what is said once, some of it in each episode
+        self._across: dict[str, None] = {}  # who moved across the lane when it moved last
         reviser = guard.reviser
         judge = reviser.risk if isinstance(reviser, ActionReviser) else None
         self._mode = reviser.mode if isinstance(reviser, ActionReviser) else Mode.ACT
@@ -376,7 +378,22 @@ class Decider:
         observation: Any = _numbers(row.observation)
         if self.form.scenes:
             observation = _moving(row, (message for message, _ in reversed(self._recent)))
+            self._turn(row, observation.reshape(-1, len(COLUMNS)))
         return self._without_lost_audit(lambda: self.guard.decide(observation, proposal, row.time))
+
+    def _turn(self, row: Row, table: NDArray[np.float64]) -> None:
+        """Who came across the lane and stands there is as long along it as it is wide."""
+        if not (isinstance(self.latest, Row) and self.latest.time < row.time):
+            self._across.clear()
+        for name, values in zip(row.objects, table[1:], strict=False):
+            across = lies_across(values[_VX], values[_VY])
+            if across is None and name in self._across:
+                values[_SIDES], across = values[_SIDES[::-1]], True
+            self._across.pop(name, None)
+            if across:
+                self._across[name] = None  # the latest last
+        for name in [*self._across][:-_RECENT]:
+            del self._across[name]
 
     def _without_lost_audit(self, call: Callable[[], _T]) -> _T:
         """Somebody has to go on; the log says itself with which record it ends."""
