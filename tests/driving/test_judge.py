@@ -229,6 +229,18 @@ def test_who_comes_towards_one_is_no_car_that_stands(noise):
     assert "avoids" not in last.reason
 
 
+def test_who_is_pushed_does_not_creep_up_to_a_leader_that_stands():
+    judge = LatentRisk(-6.0, 0.1, decel=6.0, leader_decel=9.0)
+    guard, gap, speed = guard_for_cars(-6.0, 2.5, 0.1, judge=judge), 20.0, 8.0
+    for _ in range(60):
+        revision = guard.decide([gap, speed, 0.0], 0.5)
+        # A gap that is too small is not regained by stopping in it.
+        assert gap > judge.margin or "regains" not in revision.reason
+        reached = max(speed + 0.1 * revision.executed, 0.0)
+        gap, speed = gap - 0.05 * (speed + reached), reached
+    assert (speed, gap > 0.1) == (0.0, True)
+
+
 def collides(gap, speed, ahead, brakes_at, worst, waves=()):
     """Behind a leader that goes on as it is, or in waves, and then brakes as hard as is assumed."""
     leader = Leader(STEADY, worst, brake_time=brakes_at, initial_speed=ahead, waves=waves)

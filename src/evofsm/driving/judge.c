@@ -166,7 +166,7 @@ static int regains(const double here[3], double acceleration, double braking) {
   double then[3] = {here[0], greater(here[1], 0.0), greater(here[2], 0.0)};
   then[0] += drive_on(&then[2], -braking, REGAIN);
   then[0] -= drive_on(&then[1], acceleration, REGAIN);
-  return survives(then, 0.0, acceleration, WORST, CLEARANCE);
+  return then[0] > CLEARANCE && survives(then, 0.0, acceleration, WORST, CLEARANCE);
 }
 
 /* LatentRisk._leader_braking: since the observation before, if it is the same leader. */

@@ -79,10 +79,10 @@ def foresee(
     """Write what comes of accelerations if the leader goes on as it is seen: ``found`` (2, k).
 
     First whether full braking after each, if need be, avoids a collision with a leader that goes on
-    ``braking`` so hard [m/s²]: whether the gap stays above the margin, or where it is smaller
-    already, does not shrink to half of it. Up to ``hardest`` full braking is as hard as what is
-    asked, if that is harder. Then whether each, held for ``regain`` [s], has regained a gap in
-    which who keeps the speed survives a leader that brakes by ``worst`` [m/s²].
+    ``braking`` so hard [m/s²]: whether the gap stays above the margin, or above half of what it is
+    now, where that is less. Up to ``hardest`` full braking is as hard as what is
+    asked, if that is harder. Then whether each, held for ``regain`` [s], has regained a gap above
+    the margin in which who keeps the speed survives a leader that brakes by ``worst`` [m/s²].
     """
     gap, (speed, leader_speed) = observation[0], _speeds(observation)
     room = max(gap, _TOUCHING)
@@ -95,7 +95,7 @@ def foresee(
         distance, end_speed = _drive_on(speed, accelerations[k], regain)
         then = (gap + leader_distance - distance, end_speed, leader_end_speed)
         later = Body(body.decel, body.lag, body.margin, accelerations[k], body.dt)
-        found[1, k] = survives(then, 0.0, later, worst)
+        found[1, k] = then[0] > body.margin and survives(then, 0.0, later, worst)
 
 
 @kernel
