@@ -241,6 +241,24 @@ def test_who_is_pushed_does_not_creep_up_to_a_leader_that_stands():
     assert (speed, gap > 0.1) == (0.0, True)
 
 
+@pytest.mark.parametrize(("comfort", "is_late"), [(3.0, True), (6.0, False)])
+def test_guards_in_a_row_make_each_other_late_unless_they_brake_in_full_at_once(comfort, is_late):
+    how = {"decel": 6.0, "leader_decel": 9.0, "comfort": comfort}
+    judges = [LatentRisk(-6.0, 0.1, **how) for _ in range(3)]
+    guards = [guard_for_cars(-6.0, 2.5, 0.1, judge=one) for one in judges]
+    places, speeds, smallest = np.arange(150.0, -1.0, -50.0), np.full(4, 20.0), np.inf
+    for k in range(160):
+        rows = np.column_stack([-np.diff(places) - 5.0, speeds[1:], speeds[:-1]])
+        smallest = min(smallest, rows[:, 0].min())
+        wishes = np.where(speeds[1:] < 30.0, 1.0, 0.0)
+        deeds = [
+            one.decide(*asked).executed for one, *asked in zip(guards, rows, wishes, strict=True)
+        ]
+        reached = np.maximum(speeds + 0.1 * np.array([-8.0 if k > 50 else 0.0, *deeds]), 0.0)
+        places, speeds = places + 0.05 * (speeds + reached), reached
+    assert (smallest <= 0.0) == is_late
+
+
 def collides(gap, speed, ahead, brakes_at, worst, waves=()):
     """Behind a leader that goes on as it is, or in waves, and then brakes as hard as is assumed."""
     leader = Leader(STEADY, worst, brake_time=brakes_at, initial_speed=ahead, waves=waves)
