@@ -80,9 +80,9 @@ def foresee(
 
     First whether full braking after each, if need be, avoids a collision with a leader that goes on
     ``braking`` so hard [m/s²]: whether the gap stays above the margin, or above half of what it is
-    now, where that is less. Up to ``hardest`` full braking is as hard as what is
-    asked, if that is harder. Then whether each, held for ``regain`` [s], has regained a gap above
-    the margin in which who keeps the speed survives a leader that brakes by ``worst`` [m/s²].
+    now, where that is less. Up to ``hardest`` full braking is as hard as what is asked, if that is
+    harder. Then whether each, held for ``regain`` [s], has regained a gap above the margin in which
+    who keeps the speed survives a leader that brakes by ``worst`` [m/s²].
     """
     gap, (speed, leader_speed) = observation[0], _speeds(observation)
     room = max(gap, _TOUCHING)

@@ -271,10 +271,10 @@ def test_a_reviser_without_risks_alarms_where_it_differs():
     assert (answer["alarm"], answer["mode"], answer["risk_proposed"]) == (True, "act", None)
 
 
-def test_in_traffic_who_came_across_the_lane_and_stands_there_still_lies_across():
+def test_in_traffic_who_came_across_the_lane_and_stands_there_is_still_there():
     decider = Decider(guard_of_monitor(0.1, 6.0, traffic=True))
     ego = {"x": 0.0, "y": 0.0, "vx": 15.0, "length": 5.0}
-    lorry = {"id": "lorry", "x": 20.0, "y": 5.0, "length": 12.0, "width": 2.5}
+    lorry = {"id": "lorry", "x": 40.0, "y": 5.0, "length": 12.0, "width": 2.5}
 
     def seen(k, vx, vy):
         told = {"time": 0.1 * k, "ego": ego, "objects": [lorry | {"vx": vx, "vy": vy}]}
@@ -282,9 +282,10 @@ def test_in_traffic_who_came_across_the_lane_and_stands_there_still_lies_across(
         return answer["role"], answer["risk_proposed"]
 
     speeds = [(0.0, -4.0), (0.0, -0.3), (0.0, 0.0), (5.0, 0.0), (0.0, 0.0), (0.0, -4.0)]
-    found = [seen(k, *speed) for k, speed in enumerate(speeds)]
-    across, free = [("crossing", 1.0), ("ahead", 1.0), ("ahead", 1.0)], [(None, 0.0)] * 2
-    assert found == [*across, *free, across[0]]
+    roles = [seen(k, *speed)[0] for k, speed in enumerate(speeds)]
+    assert roles == ["crossing", "ahead", "ahead", None, None, "crossing"]
+    lorry["x"] = 27.0  # 23.25 m to its side, 18.5 m to its rear if it lies along the road
+    assert [seen(6, 0.0, -4.0), seen(7, 0.0, 0.0)] == [("crossing", 0.0), ("ahead", 1.0)]
     decider.answer(b'{"end": true, "failed": false}')
     assert seen(9, 0.0, 0.0) == (None, 0.0)  # another lorry, perhaps
 

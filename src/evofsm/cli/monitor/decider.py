@@ -382,13 +382,13 @@ class Decider:
         return self._without_lost_audit(lambda: self.guard.decide(observation, proposal, row.time))
 
     def _turn(self, row: Row, table: NDArray[np.float64]) -> None:
-        """Who came across the lane and stands there is as long along it as it is wide."""
+        """Who came across the lane and stands there may lie either way: a leap looks alike."""
         if not (isinstance(self.latest, Row) and self.latest.time < row.time):
             self._across.clear()
         for name, values in zip(row.objects, table[1:], strict=False):
             across = lies_across(values[_VX], values[_VY])
             if across is None and name in self._across:
-                values[_SIDES], across = values[_SIDES[::-1]], True
+                values[_SIDES], across = values[_SIDES].max(), True
             self._across.pop(name, None)
             if across:
                 self._across[name] = None  # the latest last
