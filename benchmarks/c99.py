@@ -430,7 +430,7 @@ def _said(
     is_kinematic = isinstance(reviser.risk, LatentRisk)
     tell = _kinematic if is_kinematic else _learnt
     reason = tell(guard, code, dict(zip(NUMBERS, number.tolist(), strict=True)))
-    is_other = done[0] != done[1] if is_kinematic else code["reason"] in (1, 2, 3)
+    is_other = not code["passes"] if is_kinematic else code["reason"] in (1, 2, 3)
     if is_other and not reviser.acts:
         reason = f"{reviser.passing or reviser.mode.value}: {reason}"
     new = "never seen before, as far as the states tell" if code["is_new"] else ""

@@ -60,7 +60,9 @@ BRAKES = 6.0  #: what a car's brakes are reckoned with where nobody said [m/s²]
 SUMO = (".sumocfg", ".sumo.cfg")  #: how names of configurations of SUMO end
 Brakes = Annotated[
     float,
-    option("Hardest braking of the own car, that a guard reckons with [m/s²].", min=0.5, max=20.0),
+    option(
+        "Hardest braking of the own car; a guard executes none harder [m/s²].", min=0.5, max=20.0
+    ),
 ]
 
 

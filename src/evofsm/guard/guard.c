@@ -306,6 +306,9 @@ int evofsm_decide_at(evofsm_state *state, const double observation[EVOFSM_VARIAB
   if ((intake & (EVOFSM_REPEATED | EVOFSM_LATE)) == 0) {
     follow(state, out->executed);
   }
+  if (!ACTS && out->remark == EVOFSM_OUTSIDE) {
+    memcpy(out->executed, proposal, sizeof out->executed); /* who does not act changes nothing */
+  }
   return EVOFSM_OK;
 }
 /* ==== modelDescription.xml ==== */

@@ -35,6 +35,7 @@ from evofsm.guard.actions import (
     checked_mask,
     fixed,
     no_action,
+    put_into,
 )
 from evofsm.guard.api import (
     BELIEF_TOLERANCE,
@@ -672,7 +673,7 @@ class Guard:
             guard with an audit log, which could not be replayed then.
         """
         revision = self.reviser.revise(situation, proposal)
-        if not isinstance(self.reviser, ActionReviser):  # whose actions are of the set
+        if not isinstance(self.reviser, ActionReviser):  # which executes nothing else if it acts
             self._refuse_unfit(revision.executed)
         if self.explaining or self.audit is not None:
             revision = self._explained(situation, revision)
@@ -693,7 +694,8 @@ class Guard:
         raise ValueError(f"{name} would execute {action!r}, which is none of {self.actions}")
 
     def _take_in(self, situation: Situation, executed: Action) -> None:
-        """Machine and judge learn what was executed."""
+        """Machine and judge learn what was executed, or of the set what is closest to it."""
+        executed = put_into(self.actions, executed)
         self._decisions += 1
         if self.machine is not None and self._learn and situation.state is not None:
             self.machine.act(self.actions.encode(executed))
@@ -718,7 +720,7 @@ class Guard:
             return revision
         if not (self.explaining or is_spoken(self.reviser, revision)):
             return revision
-        action = self.actions.encode(revision.executed)
+        action = self.actions.encode(put_into(self.actions, revision.executed))
         if self._frozen is None:
             text = self.machine.explain(action, self._labels).text
         else:

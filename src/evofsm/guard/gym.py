@@ -31,7 +31,7 @@ from evofsm.guard.actions import (
 from evofsm.guard.api import Proposal, Revision
 from evofsm.guard.guard import Guard, answered
 from evofsm.guard.loop import action_masks
-from evofsm.guard.reviser import make_usable, unjudged_revision
+from evofsm.guard.reviser import make_usable, passed, unjudged_revision
 
 with needs("gymnasium", "gym", "a wrapper for Gymnasium"):
     import gymnasium
@@ -469,7 +469,8 @@ class Terms:
 
     def unjudged(self, proposal: Proposal, why: str) -> Revision:
         """The proposal, made usable, where nothing is judged."""
-        action, remark = make_usable(proposal, self.guard.actions, self.guard.fallback)
+        usable = make_usable(proposal, self.guard.actions, self.guard.fallback)
+        action, remark = passed(proposal, usable, self.guard.reviser)
         return unjudged_revision(action, proposal, f"{why}; {remark or 'not revised'}")
 
     def decided(self, action: Any, revision: Revision) -> Decided:

@@ -119,6 +119,17 @@ def make_usable(proposal: Proposal, actions: ActionSet, fallback: Fallback = NOT
     return Usable(action, f"no usable proposal ({name}): {words}")
 
 
+def passed(proposal: Proposal, usable: Usable, reviser: Reviser) -> Usable:
+    """What is executed of a proposal that passes: in any mode but `Mode.ACT` the very proposal.
+
+    That may lie outside the set, or not be allowed: whoever does not act changes nothing.
+    """
+    can_pass = usable.remark and is_usable(reviser.actions, proposal.action)
+    if not can_pass or getattr(reviser, "mode", Mode.ACT) is Mode.ACT:
+        return usable
+    return Usable(fixed(proposal.action), usable.remark.partition(": ")[0])
+
+
 class ActionReviser:
     """Keeps a proposal whose latent risk is tolerable, and replaces any other.
 
@@ -135,8 +146,9 @@ class ActionReviser:
     risk : ActionJudge
         Usually a `LatentRisk`.
     actions : IntervalActions, Choices or BoxActions
-        Nothing outside it is ever executed. Of `Choices` none is closer than another: a proposal is
-        kept, or replaced by the least risky one. In a box change is counted in half ranges.
+        In `Mode.ACT` nothing outside it is ever executed. Of `Choices` none is closer than another:
+        a proposal is kept, or replaced by the least risky one. In a box change is counted in half
+        ranges.
     tolerance : float
         Highest latent risk that is accepted, in (0, 1).
     mode : Mode
@@ -196,9 +208,10 @@ class ActionReviser:
         return self.mode is Mode.ACT and not self.passing
 
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
-        """What to execute instead of the proposal, which is first made usable (`make_usable`)."""
+        """What to execute instead of the proposal, of which is judged what `make_usable` makes."""
         acts = self.acts
-        action, remark = make_usable(proposal, self.actions, self.fallback)
+        action, remark = usable = make_usable(proposal, self.actions, self.fallback)
+        original, remark = passed(proposal, usable, self)
         is_far = remark[:8] == "proposal" and np.any(abs(proposal.action - action) > self._far)
         self._clipped = self._clipped + 1 if is_far else 0
         if self._clipped == _CLIPPED:
@@ -206,7 +219,8 @@ class ActionReviser:
         if not acts:
             self._trial = 0
         if self.mode is Mode.OFF:
-            return unjudged_revision(action, proposal, remark or "reviser is off")
+            revision = unjudged_revision(original, proposal, remark or "reviser is off")
+            return revision._replace(advised=fixed(action))
         options, judgement, best, reason = self._search(situation, action, acts, proposal.mask)
         index, advice = best if acts else 0, fixed(options[best])
         if not acts and best != 0:
@@ -215,7 +229,7 @@ class ActionReviser:
         # Of a situation that is new: whether it is dangerous is another question.
         new = "never seen before, as far as the states tell" if judgement.seen < _NEW else ""
         return Revision(
-            executed=advice if acts else fixed(options[0]),
+            executed=advice if acts else fixed(original),
             proposed=fixed(proposal.action),
             risk_proposed=float(judgement.risk[0]),
             risk_executed=float(judgement.risk[index]),

@@ -76,7 +76,8 @@ def monitor(
 
     A row: {"time": 0.1, "gap": 32, "v_follower": 20, "v_leader": 18, "proposal": 0.5}, in s, m,
     m/s and m/s²; docs/monitor.md describes all messages. Without --learn only a guard that begins
-    learns; nothing is changed without --mode act. Ctrl-C or SIGTERM ends it, with everything saved.
+    learns; nothing is changed without --mode act, and with it nothing beyond the guard's range is
+    executed. Ctrl-C or SIGTERM ends it, with everything saved.
     Rows are read as options from --observe to --hole say, without one as the guard's log was,
     whatever default stands there.
 

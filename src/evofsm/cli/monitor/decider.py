@@ -31,7 +31,7 @@ from evofsm.fsm.validation import probability
 from evofsm.guard import ActionReviser, BoxActions, Choices, Foresight, Guard, LearntRisk, Mode
 from evofsm.guard.api import Proposal, Revision
 from evofsm.guard.foresight import DATES
-from evofsm.guard.reviser import is_spoken, make_usable
+from evofsm.guard.reviser import is_spoken, make_usable, passed
 from evofsm.io.logs import hours_unsaid
 from evofsm.io.tables import IN_UTC, date
 
@@ -326,6 +326,12 @@ class Decider:
             self.rows += 1
             self._alarm = self._is_alarm(revision)
             body = self._revised(row, revision)
+        remark = body["reason"].partition(";")[0]
+        if self._mode is Mode.ACT and remark[:8] == "proposal" and "is outside [" in remark:
+            proposal: Any = row.proposal
+            if self._is_first(f"below: {np.any(np.less(proposal, self.guard.actions.low))}"):
+                text = "%s at %s s, and was put at its edge, as all such are in --mode act"
+                _log.warning(f"{text} (--brakes, --low, --high)", remark, row.time)
         on = {"alarm": self._alarm, "mode": self._mode.value}
         return self._of("decision", row, **body, **on, **note)
 
@@ -345,7 +351,8 @@ class Decider:
     def _unjudged(self, row: Row, why: str) -> Answer:
         """What is executed where nothing is judged, made usable as before a decision, and why."""
         proposal: Any = math.nan if row.proposal is None else row.proposal
-        action, remark = make_usable(Proposal(proposal), self.guard.actions, self.guard.fallback)
+        usable = make_usable(Proposal(proposal), self.guard.actions, self.guard.fallback)
+        action, remark = passed(Proposal(proposal), usable, self.guard.reviser)
         executed = int(action) if isinstance(self.guard.actions, Choices) else plain(action)
         return {"executed": executed, "reason": "; ".join(filter(None, (remark, why)))}
 
