@@ -92,6 +92,37 @@ def test_what_cannot_be_exported_is_refused_in_one_line(refused, driven, argumen
     assert word in refused(*given)
 
 
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("wall.sumocfg", "export {learnt} --to fmu --out"),
+        ("my.csv", "export {learnt} --to dot --out"),
+        ("my.csv", "export {learnt} --to prism --out"),
+        ("main.c", "export {learnt} --to c99 --prefix main --out {folder}"),
+        ("index.html", "paper --out {folder}"),
+        ("model.evofsm", "paper --out {folder}"),
+        *((name, "drive emergency --out {folder}") for name in ("guard.evofsm", "episodes.csv")),
+        ("episodes.jsonl", "drive emergency --out {folder}"),
+        ("guard.evofsm", "learn {log} --action= --out"),
+    ],
+)
+def test_what_something_else_wrote_is_left_alone(refused, driven, tmp_path, name, words):
+    (tmp_path / "log.csv").write_text("gap,v_follower,v_leader\n1,1,1\n")
+    kept = (driven[0] / "guard.evofsm").read_bytes() if "evofsm" in name else b"<?xml"
+    (path := tmp_path / name).write_bytes(kept)
+    places = {"learnt": driven[0], "folder": tmp_path, "log": tmp_path / "log.csv"}
+    given = [word.format(**places) for word in words.split()]
+    assert "it was left alone" in refused(*given, *[path] * (given[-1] == "--out"))
+    assert path.read_bytes() == kept
+    assert sorted(tmp_path.iterdir()) == sorted([path, tmp_path / "log.csv"])
+
+
+@pytest.mark.parametrize("to", ["dot", "prism", "c99"])
+def test_what_was_exported_is_exported_anew(evofsm, driven, tmp_path, to):
+    for _ in range(2):
+        assert evofsm("export", driven[0], "--to", to, "--out", tmp_path / "new").exit_code == 0
+
+
 def test_no_text_from_a_file_tells_the_terminal_what_to_do(evofsm, tmp_path):
     machine = EvolvingFSM(n_actions=1, radius=0.5)
     machine.learn_many([[0.0], [0.1], [2.0], [1.0]], [0, 0, 0, 0], failures=[3])

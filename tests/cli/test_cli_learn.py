@@ -291,6 +291,7 @@ def test_failures_are_learnt_and_how_often_they_came_is_said(evofsm, log, tmp_pa
     assert "2 of 3" in " ".join(evofsm("explain", path, "--state", "1").stdout.split())
     evofsm("learn", log, "--failed", "gap<-99", "--out", path)  # nor does the last one fail
     assert "0 of 3" in " ".join(evofsm("explain", path, "--state", "1").stdout.split())
+    path = tmp_path / "guard"
     evofsm("learn", log, "--guard", path)  # nor does anything tell of failures
     assert "not known" in " ".join(evofsm("explain", path, "--state", "1").stdout.split())
 

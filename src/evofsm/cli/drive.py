@@ -28,6 +28,8 @@ def paper(
     """
     options.require_world(world, polars="tables", matplotlib="plot", jinja2="plot")
     out.mkdir(parents=True, exist_ok=True)  # where that fails nothing is driven first
+    files = ("index.html", "claims.json", "model.evofsm")
+    options.refuse_foreign("evofsm</title>", *(out / name for name in files))
     from evofsm.cli.show import print_json, print_page, progress
     from evofsm.driving.sumo import open_world
     from evofsm.paper import Settings, check_claims, run_paper

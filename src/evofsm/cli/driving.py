@@ -22,7 +22,7 @@ from typing import Any
 
 from evofsm import driving, store
 from evofsm.cli.journal import Journal, asked_to_stop
-from evofsm.cli.options import split_names
+from evofsm.cli.options import refuse_foreign, split_names
 from evofsm.cli.show import Advance, plain, print_json, progress, show, table, warn
 from evofsm.driving.cars import TOLD, name_judge
 from evofsm.driving.naming import DECISION_COLUMNS
@@ -120,6 +120,8 @@ class Results:
 
     def _begin(self, folder: Path) -> None:
         setup = self.setup
+        files = [folder / name for name in (_JOURNAL, GUARD, _EPISODES, _DECISIONS)]
+        refuse_foreign("", *files)  # a foreign journal says so itself
         folder.mkdir(parents=True, exist_ok=True)
         self._journal = Journal(folder / _JOURNAL, "name another folder")
         try:

@@ -7,8 +7,12 @@ import textwrap
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from evofsm.cli import options
 from evofsm.cli.options import Json, ModeName, Saved, option
 
+# What stands in the beginning of files of each format, of c99 of the header.
+_MARKS = {"dot": "digraph evofsm", "prism": "// A machine of", "c99": "/* Exported by evofsm"}
+_MARKS["fmu"] = "modelDescription.xml"
 _UNTOLD = (
     "Which episodes failed is not known: nothing said so. From a log, evofsm learn "
     "--failed COLUMN or --failed 'gap<=0' says it."
@@ -127,7 +131,9 @@ def export(
     ] = None,
 ) -> None:
     """Write what was learnt, or driven, in the formats of other tools."""
-    _refuse_learnt(out)
+    names = [f"{prefix or 'evofsm'}.{suffix}" for suffix in ("h", "hpp", "c")]
+    if out is not None:
+        options.refuse_foreign(_MARKS[to], *(out / name for name in names if to == "c99"), out)
     is_code = to in ("c99", "fmu")
     unfit: Any = {"--least": least, "--evidence": evidence} if is_code else {"--mode": mode}
     unfit |= {} if to == "c99" else {"--prefix": prefix}
@@ -166,17 +172,3 @@ def export(
         return
     with store.replacing(out) as stream:
         stream.write(text.encode())
-
-
-def _refuse_learnt(out: Path | None) -> None:
-    """Raise where a graph would take the place of what cannot be had again."""
-    from evofsm.store import read_header
-
-    if out is None or not out.is_file():
-        return
-    if not out.read_bytes().startswith(b"\x89MCAP"):  # as logs of runs do
-        try:
-            read_header(out)
-        except ValueError:
-            return
-    raise ValueError(f"--out {out}: what was learnt or driven is kept there; it was left alone")

@@ -63,8 +63,8 @@ def learn(
     from evofsm.io import Chunk, episodes_of, read_traces
     from evofsm.io.logs import Noted
 
-    learning.check_out(out)
-    learning.check_out(guard, "--guard")
+    learning.check_out(out, "model")
+    learning.check_out(guard, "guard", "--guard")
     columns = options.reading_of(**reading)
     if _is_looked_at(files, columns):
         if out or guard or reading:

@@ -352,8 +352,8 @@ def judge_of(judge: Judge | None, columns: LogColumns) -> Judge:
     return judge
 
 
-def check_out(out: Path | None, option: str = "--out") -> None:
-    """Refuse before the long work what could not be saved after it."""
+def check_out(out: Path | None, kind: str, option: str = "--out") -> None:
+    """Refuse before the long work what could not be saved after it: a model, or a guard."""
     if out is None:
         return
     if not out.parent.is_dir():
@@ -362,11 +362,13 @@ def check_out(out: Path | None, option: str = "--out") -> None:
         raise PermissionError(f"{option} {out}: the folder {out.parent} may not be written")
     if out.is_dir():
         raise IsADirectoryError(f"{option} {out} is a folder; name a file in it")
-    if out.exists() and out.suffix != ".evofsm":  # so are ours called, whatever wrote them
+    if out.exists():
         try:
-            store.read_header(out)
-        except (ValueError, OSError):
-            raise ValueError(f"{option} {out} is no file of evofsm; it was left alone") from None
+            content = f"holds a {store.read_header(out).kind}"
+        except (ValueError, OSError):  # so are ours called, whatever wrote them: .evofsm
+            content = f"holds a {kind}" if out.suffix == ".evofsm" else "is no file of evofsm"
+        if content != f"holds a {kind}":
+            raise ValueError(f"{option} {out} {content}; it was left alone")
 
 
 # -- What came of it ------------------------------------------------------------------------------

@@ -84,6 +84,15 @@ def picture(out: Path, width: float, height: float) -> Iterator[Figure]:
         figure.savefig(out)
 
 
+def refuse_foreign(mark: str, *paths: Path) -> None:
+    """Raise where a file would be written over, and the first begins without the mark of ours."""
+    begin = paths[0].read_bytes()[:1000] if paths[0].is_file() else None
+    if begin is None or mark.encode() not in begin:
+        for path in filter(Path.is_file, paths):
+            text = "is not what would be written there anew; it was left alone: name another one"
+            raise FileExistsError(f"{path} {text}")
+
+
 def require_world(world: str, **extras: str) -> None:
     """The same for a drive: SciPy is for SUMO's distributions and exact intervals."""
     require(scipy="study", **({"libsumo": "sumo"} if world == "sumo" else {}), **extras)
