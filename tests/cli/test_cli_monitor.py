@@ -87,6 +87,14 @@ def test_a_state_goes_on_over_runs_and_may_be_the_guards_own_file(tmp_path):
     assert 'episode was 6000 and is now [6000, "lane"]' in refused.stderr
 
 
+@pytest.mark.parametrize("content", [b"", b'{"tyme": 0.0}\n', ROWS[0].decode().encode("utf-16")])
+def test_a_file_of_which_no_row_is_decided_on_ends_with_2(content, tmp_path):
+    (path := tmp_path / "rows.jsonl").write_bytes(content)
+    result = evofsm(path)
+    assert result.exit_code == evofsm(path, "--summary").exit_code == 2
+    assert f"no row of {path} was decided on" in result.stderr
+
+
 def test_a_file_is_taken_in_once_and_as_it_grows_what_is_new_of_it(tmp_path):
     log, other, state = (tmp_path / name for name in ("log.csv", "other.csv", "state.evofsm"))
     names = "time,gap,v_follower,v_leader,a_follower"

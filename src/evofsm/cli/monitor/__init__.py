@@ -236,6 +236,7 @@ def monitor(
             server.run(transport)
             if file and not decider.n:
                 warn(f"no row of {file} was decided on")
+                return 2  # as --summary does
         except BrokenPipeError:
             warn("nobody reads the decisions any more")
             return 1
