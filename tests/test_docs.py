@@ -163,6 +163,14 @@ def test_the_notebook_prints_what_it_shows(capsys):
     assert f"20 other flights, {n_failures} of which failed" in gallery
 
 
+def test_who_is_to_type_a_command_is_told_to_install_the_command_line():
+    for page in PAGES:
+        text = page.read_text()
+        for extras in re.findall(r"pip install\s+'\.\[([\w,]+)\]'", text):
+            is_typed = re.search(r"^\$ evofsm|`evofsm (learn|watch|monitor|drive)\b", text, re.M)
+            assert not is_typed or {"cli", "all"} & {*extras.split(",")}, (page, extras)
+
+
 def test_commands_that_are_not_run_would_be_understood():
     """Every command and option that a page names is there."""
     group = typer.main.get_command(application())
