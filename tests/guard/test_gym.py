@@ -27,6 +27,7 @@ from evofsm.guard import (
     Fallback,
     Judgement,
     LearningJudge,
+    Mode,
     RevisedActions,
     RevisedAgents,
     RevisedVectorActions,
@@ -223,7 +224,10 @@ def test_actions_that_are_not_the_guards_are_refused(space, guarded):
         (Box(-2.0, 2.0, (2, 1), np.float32), [[1.0], [2.0]], [[0.5], [0.5]], 10.0**0.5 / 4.0),
         (Box(-2.0, 2.0, (1,), np.float32), [9.0], [0.5], 0.75),
         (Box(-2.0, 2.0, (1,), np.float32), [math.nan], [0.0], 1.0),
-        (Box(-4.0, 4.0, (1,), np.float32), [9.0], [0.5], 1.75),  # beyond the guard's 2, too
+        pytest.param(
+            *(Box(-4.0, 4.0, (1,), np.float32), [9.0], [0.5], 1.75),  # beyond the guard's 2, too
+            marks=pytest.mark.filterwarnings("ignore:the guard's actions go"),
+        ),
         (Box(-2.0, 2.0, (), np.float32), 1.0, 0.5, 0.25),
     ],
 )
@@ -432,6 +436,14 @@ def test_a_guard_may_not_act_beyond_what_a_wrapper_clips_to():
         wrap(env, Guard(low=-2.5, high=2.5, interval=0.1))
         with pytest.raises(ValueError, match="beyond"):
             wrap(env, Guard(low=-2.5, high=3.0, interval=0.1))
+
+
+def test_a_guard_that_is_narrower_than_the_environment_is_told_of_and_in_shadow_changes_nothing():
+    env, guard = Script(FAR, FAR), Guard(low=-1.0, high=1.0, interval=0.1, mode=Mode.SHADOW)
+    with pytest.warns(UserWarning, match=r"go from -1\.0 to 1\.0, .* put at its edge") as told:
+        drive(RevisedActions(env, guard), lambda *_: np.array([-2.0]))
+    assert told[0].filename == __file__
+    assert env.executed == [[-2.0]]
 
 
 class Again(gymnasium.Wrapper):

@@ -580,6 +580,13 @@ def _conversions(space: Space[Any], actions: ActionSet) -> tuple[_Convert, _Conv
             f"the guard's actions go from {actions.low} to {actions.high}, beyond those of the "
             f"environment, {space}; make a guard of the environment's low and high"
         )
+    is_narrower = (low > space.low + slack) | (high < space.high - slack)
+    if (is_narrower & np.isfinite(space.low) & np.isfinite(space.high)).any():
+        warnings.warn(
+            f"the guard's actions go from {actions.low} to {actions.high}, the environment's "
+            f"further, {space}: where it acts, those beyond are put at its edge, safe or not",
+            stacklevel=4,
+        )
 
     def to_guard(action: Any) -> Action:
         array = np.array(action, dtype=np.float64)
