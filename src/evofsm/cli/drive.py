@@ -103,6 +103,8 @@ def drive(
     options.refuse_typed(ctx, ["mode", "tolerance"] * (reviser == "none"), "--reviser least-risk")
     if workers is not None and (audit or mcap):
         raise ValueError("--audit and --mcap go with no --workers: workers send no decisions")
+    if workers is not None and frozen is None and reviser != "none":
+        warn("warning: --workers learn nothing: --frozen FOLDER drives with what was learnt there")
     extras = {"polars": "tables"} if out is not None and workers is None else {}
     options.require_world(world, **extras, **({"mcap": "mcap"} if mcap else {}))
     from evofsm.driving import load_family
