@@ -165,7 +165,7 @@ def tables_of(model: FSMModel) -> Iterator[RenderableType]:
             zip(centers, model.visits.tolist(), model.created.tolist(), strict=True)
         )
     ]
-    title = "States (stays: share of its steps; first seen: at which row)"
+    title = "States (time: while it learnt; stays: share of its steps; first seen: at which row)"
     most = sorted(np.argsort(-model.visits, kind="stable")[:_STATES_LISTED].tolist())
     yield ""
     header = ("", *heads, "share of time", "stays", "first seen")
@@ -198,10 +198,11 @@ def model_facts(model: FSMModel) -> list[tuple[str, str]]:
     settings = ", ".join(f"{name} {value:g}" for name, value in model.settings.items())
     step = "the step is not known" if model.dt is None else f"one every {model.dt:g} s"
     failures = f"{model.endings.sum():,.0f} episodes ended in one"
-    actions = f"{model.labels.action(0)} to {model.labels.action(model.n_actions - 1)}"
+    ends = f"{model.labels.action(0)} to {model.labels.action(model.n_actions - 1)}"
+    actions = f", under actions {ends}" * (model.n_actions > 1)
     return [
         ("observations", f"{model.visits.sum():,.0f}, {step}"),
-        ("transitions", f"{model.uses.sum():,.0f}, under actions {actions}"),
+        ("transitions", f"{model.uses.sum():,.0f}{actions}"),
         ("states", f"{model.n_states}, of {model.n_variables} variables"),
         ("settings", settings or "not known"),
         ("failures", failures if model.failures_told else "which there were is not known"),

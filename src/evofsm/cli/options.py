@@ -73,9 +73,18 @@ def require(**extras: str) -> None:
         raise ModuleNotFoundError(f"this needs {' and '.join(packages)}: {command}")
 
 
+def refuse_unnamed(out: Path) -> None:
+    """Raise where a picture would be written to another file than was named."""
+    if out.is_dir():
+        raise IsADirectoryError(f"--plot {out} is a folder; name a file in it")
+    if not out.suffix:
+        raise ValueError(f"--plot {out}: what kind of picture says an ending, such as {out}.png")
+
+
 @contextmanager
 def picture(out: Path, width: float, height: float) -> Iterator[Figure]:
     """A figure [inch] in the house's style, which then is written to a file."""
+    refuse_unnamed(out)
     from matplotlib.figure import Figure
     from matplotlib.style import context
 

@@ -103,6 +103,7 @@ def monitor(
         raise ValueError("--plot draws what --summary says, where nobody acts")
     if plot is not None:
         options.require(matplotlib="plot")
+        options.refuse_unnamed(plot)
     is_log = file is not None and (file.suffix in _LOGS[not summary :] or file.is_dir())
     if is_log and not summary:
         raise ValueError(f"{file} is read with --summary; live rows are JSON or CSV, a line each")
