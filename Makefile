@@ -5,6 +5,10 @@ PYTHON ?= python3
 BIN := .venv/bin
 # Tests start Python often: what it compiles is kept, whatever the environment says.
 export PYTHONDONTWRITEBYTECODE =
+# Else Python reads no path with an umlaut that an editable installation names.
+ifneq (,$(filter C POSIX,$(LC_ALL)))
+export LC_ALL := C.UTF-8
+endif
 INSTALL = $(PYTHON) -m pip --python $(BIN)/python --disable-pip-version-check install --quiet
 
 .PHONY: paper watch closed-loop evidence docs test test-all check house \
