@@ -31,10 +31,9 @@ def run(*command, **options):
 
 
 @pytest.mark.skipif(not shutil.which("make"), reason="there is no make")
-@pytest.mark.parametrize(("told", "used"), [("C", "C.UTF-8"), ("de_DE.UTF-8", "de_DE.UTF-8")])
-def test_make_lets_python_read_a_path_with_an_umlaut(told, used):
+def test_make_lets_python_read_a_path_with_an_umlaut():
     command = ("make", "--silent", "--eval", "told:; @echo $$LC_ALL", "told")
-    assert run(*command, cwd=ROOT, env={**os.environ, "LC_ALL": told}).strip() == used
+    assert run(*command, cwd=ROOT, env={**os.environ, "LC_ALL": "C"}) == "C.UTF-8\n"
 
 
 # -- Importing ---------------------------------------------------------------------------------

@@ -83,7 +83,6 @@ def test_what_a_guard_has_learnt_is_said_and_drawn(evofsm, refused, tmp_path):
     for wrong, word in ((tmp_path, "is a folder"), (tmp_path / "x", "x.png")):
         assert word in refused("inspect", file, "--plot", wrong)
     assert {*tmp_path.iterdir()} == {file, drawn}
-    assert ", under actions " in " ".join(said.split())
     (machine := EvolvingFSM(1)).learn_many([[0.0], [1.0]], [0, 0])
     machine.model().save(file)
     assert "under actions" not in evofsm("inspect", file).stdout

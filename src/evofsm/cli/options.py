@@ -95,11 +95,12 @@ def picture(out: Path, width: float, height: float) -> Iterator[Figure]:
 
 def refuse_foreign(mark: str, *paths: Path) -> None:
     """Raise where a file would be written over, and the first begins without the mark of ours."""
-    begin = paths[0].read_bytes()[:1000] if paths[0].is_file() else None
-    if begin is None or mark.encode() not in begin:
-        for path in filter(Path.is_file, paths):
-            text = "is not what would be written there anew; it was left alone: name another one"
-            raise FileExistsError(f"{path} {text}")
+    for path in filter(Path.is_file, paths):
+        with path.open("rb") as file:
+            if path == paths[0] and mark.encode() in file.read(1000):
+                return
+        text = "is not what would be written there anew; it was left alone: name another one"
+        raise FileExistsError(f"{path} {text}")
 
 
 def require_world(world: str, **extras: str) -> None:
