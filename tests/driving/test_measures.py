@@ -6,6 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.driving.test_judge import smallest_gap
 
+from evofsm import Guard, IntervalActions
+from evofsm.driving import EnvelopeReviser
 from evofsm.driving.measures import (
     FIXED_MEASURES,
     DecelerationToAvoidCollision,
@@ -24,6 +26,7 @@ MEASURES = [*FIXED_MEASURES.values(), ResponsibilitySensitiveSafety.matched(2.5,
 CAN_BE_ZERO = {"reaction", "response", "accel", "margin"}
 EVERY_MEASURE = pytest.mark.parametrize("measure", MEASURES, ids=repr)
 
+ACTIONS = IntervalActions(low=-2.5, high=2.5, width=0.3)
 DT = 0.1
 SPEEDS = st.floats(0.0, 60.0)
 DECELS = st.floats(1.0, 10.0)
@@ -74,6 +77,26 @@ def test_closer_faster_or_behind_a_slower_leader_is_not_safer(measure, episode, 
 def test_far_behind_none_and_close_behind_a_standing_leader_all_call_for_braking(measure):
     assert measure.score(np.array([[200, 20, 25]]), DT) <= 0.0
     assert measure.score(np.array([[3, 20, 0]]), DT) > 0.0
+
+
+@EVERY_MEASURE
+@pytest.mark.parametrize("unseen", range(3))
+def test_who_does_not_see_brakes_and_once_it_sees_again_no_more(measure, unseen):
+    guard = Guard.of(EnvelopeReviser(measure, ACTIONS, DT), interval=DT)
+    rows = [[5.0, 20.0, 0.0], [200.0, 20.0, 25.0]]
+    rows[0][unseen] = np.nan
+    assert [guard.decide(row, 1.0).executed for row in rows] == [-2.5, 1.0]
+    assert np.isnan(time_to_collision(np.array(rows[0])))
+
+
+@EVERY_MEASURE
+def test_who_comes_towards_one_calls_for_braking(measure):
+    assert measure.score(np.array([[9.0, 10.0, -10.0]]), DT) > 0.0
+    if isinstance(measure, ResponsibilitySensitiveSafety):
+        one, both = measure.safe_distance(np.array([[9.0, 10.0, 0.0], [9.0, 10.0, -10.0]]))
+        assert both == 2.0 * one
+    head_on = [[30.0, 10.0, -10.0], [13.0, 10.0, -10.0]]
+    assert is_dead_end(head_on, 6.0, 9.0).tolist() == [False, True]
 
 
 @EVERY_MEASURE

@@ -3,7 +3,8 @@
 Every function takes ``observations``, a (..., 3) ndarray of the gap [m], the speed of the follower
 and that of the leader [m/s]; where accelerations matter, a (..., T, 3) one in the order of time.
 Every class scores them: above 0 it calls for braking, and most scores are infinite where the cars
-have met. An argument of a class that is not finite and positive raises a ValueError, except where 0
+have met. What hangs on a number that is NaN, is NaN. A leader with a negative speed comes towards
+oneself. An argument of a class that is not finite and positive raises a ValueError, except where 0
 is allowed.
 """
 
@@ -16,6 +17,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from evofsm.driving.rehearsal import ONCOMING
 from evofsm.fsm.validation import Floats, positive
 from evofsm.guard import RiskMeasure
 
@@ -27,16 +29,22 @@ def _columns(observations: Floats) -> Floats:
 
 
 def _acceleration(speed: Floats, dt: float) -> Floats:
-    """Mean acceleration since the row before; 0 in the first row, which has none."""
-    return np.diff(speed, prepend=speed[..., :1]) / positive("dt", dt)
+    """Mean acceleration since the row before; 0 in a row that has none before it."""
+    change = np.diff(speed, prepend=speed[..., :1]) / positive("dt", dt)
+    return np.where(np.isnan(change), 0.0, change)
 
 
 def _time_to_cover(gap: Floats, speed: Floats) -> Floats:
     """[s]; infinite where the speed is not positive, 0 where the gap is not."""
-    time = np.full_like(gap, np.inf)
+    time = np.asarray(gap + np.inf)  # or NaN
     with np.errstate(over="ignore"):
-        np.divide(gap, speed, out=time, where=speed > 0.0)
+        np.divide(gap, speed, out=time, where=~(speed <= 0.0))
     return np.where(gap <= 0.0, 0.0, time)
+
+
+def _way_to_stop(leader_speed: Floats, decel: float) -> Floats:
+    """[m]; negative of a leader that comes towards oneself."""
+    return leader_speed * np.abs(leader_speed) / (2.0 * decel)
 
 
 def _unsafe_once_met(gap: Floats, score: Floats) -> Floats:
@@ -106,7 +114,7 @@ def modified_time_to_collision(observations: Floats, dt: float) -> Floats:
     closing_speed = speed - leader_speed
     radicand = closing_speed**2 + 2.0 * _acceleration(closing_speed, dt) * gap
     # Gap over the mean closing speed until then: the first positive root, whatever the sign of Δa.
-    mean = np.where(radicand >= 0.0, (closing_speed + np.sqrt(np.maximum(radicand, 0.0))) / 2, 0)
+    mean = np.where(radicand < 0.0, 0, (closing_speed + np.sqrt(np.maximum(radicand, 0.0))) / 2)
     return _time_to_cover(gap, mean)
 
 
@@ -145,7 +153,7 @@ def deceleration_to_avoid_collision(observations: Floats) -> Floats:
     closing_speed = np.maximum(speed - leader_speed, 0.0)
     decel = np.zeros_like(gap)
     with np.errstate(over="ignore"):
-        np.divide(closing_speed**2, 2.0 * gap, out=decel, where=gap > 0.0)
+        np.divide(closing_speed**2, 2.0 * gap, out=decel, where=~(gap <= 0.0))
     return _unsafe_once_met(gap, decel)
 
 
@@ -208,14 +216,18 @@ class ResponsibilitySensitiveSafety(_Measure):
         """Gap from which the follower can still stop behind a leader that brakes in full [m].
 
         v·ρ + a·ρ²/2 + (v + ρ·a)² / (2·decel) − v_leader² / (2·leader_decel), or 0 if that is
-        negative, where v is the follower's speed, ρ the ``response`` and a ``accel``.
+        negative, where v is the follower's speed, ρ the ``response`` and a ``accel``. A leader that
+        comes towards oneself needs the same as the follower; the safe distance is the sum.
         """
         _, speed, leader_speed = _columns(observations)
+        leader_way = _way_to_stop(leader_speed, self.leader_decel)
+        comes = leader_speed < ONCOMING
+        leader_way = np.where(comes, -self._stopping_distance(-leader_speed), leader_way)
+        return np.asarray(np.maximum(self._stopping_distance(speed) - leader_way, 0.0))
+
+    def _stopping_distance(self, speed: Floats) -> Floats:
         fastest = speed + self.response * self.accel
-        response_distance = (speed + fastest) / 2.0 * self.response
-        stopping_distance = response_distance + fastest**2 / (2.0 * self.decel)
-        distance = stopping_distance - leader_speed**2 / (2.0 * self.leader_decel)
-        return np.asarray(np.maximum(distance, 0.0))
+        return (speed + fastest) / 2.0 * self.response + fastest**2 / (2.0 * self.decel)
 
 
 @dataclass(frozen=True)
@@ -263,7 +275,7 @@ class PerformanceModel(_Measure):
 def _membership(gap: Floats, unsafe: Floats, safe: Floats) -> Floats:
     """1 below ``unsafe``, 0 from ``safe`` on, and linear in between."""
     member = np.asarray(gap < unsafe, dtype=np.float64)
-    np.divide(safe - gap, safe - unsafe, out=member, where=(gap >= unsafe) & (gap < safe))
+    np.divide(safe - gap, safe - unsafe, out=member, where=~((gap < unsafe) | (gap >= safe)))
     return member
 
 
@@ -304,7 +316,7 @@ class FuzzySafety(_Measure):
         s(comfortable_decel) + margin, and linear in between.
         """
         gap, speed, leader_speed = _columns(observations)
-        common_distance = speed * self.reaction - leader_speed**2 / (2.0 * self.leader_decel)
+        common_distance = speed * self.reaction - _way_to_stop(leader_speed, self.leader_decel)
         unsafe = common_distance + speed**2 / (2.0 * self.decel)
         safe = common_distance + speed**2 / (2.0 * self.comfortable_decel) + self.margin
         return np.where(gap <= 0.0, 1.0, _membership(gap - self.margin, unsafe, safe))
@@ -323,7 +335,7 @@ class FuzzySafety(_Measure):
         accel = _acceleration(speed, dt)
         later = closing_speed + np.maximum(accel, -comfortable) * self.reaction
         gap_loss = (closing_speed + later) / 2.0 * self.reaction
-        approaches = closing_speed > 0.0
+        approaches = ~(closing_speed <= 0.0)
         slows = approaches & (later < 0.0)
         # What the present braking needs until the speeds are equal.
         present = np.zeros_like(gap)
@@ -365,7 +377,7 @@ def is_dead_end(observations: Floats, decel: float, leader_decel: float) -> NDAr
     array([False,  True])
     """
     gap, speed, leader_speed = _columns(observations)
-    final_gap = gap + leader_speed**2 / (2 * leader_decel) - speed**2 / (2 * decel)
+    final_gap = gap + _way_to_stop(leader_speed, leader_decel) - speed**2 / (2 * decel)
     smallest = np.minimum(gap, final_gap)
     # A follower who brakes harder is nearest when the speeds meet, if both still move then.
     if decel > leader_decel:
