@@ -18,7 +18,8 @@ import one_guard
 from evofsm import EvolvingFSM, Guard, IntervalActions, Labels, store
 from evofsm.driving.cars import guard_for_cars
 from evofsm.driving.judge import LatentRisk
-from evofsm.driving.revisers import Unrevised
+from evofsm.driving.measures import ModifiedTimeToCollision
+from evofsm.driving.revisers import EnvelopeReviser, Unrevised
 from evofsm.guard.actions import Choices, put_into, same_action
 from evofsm.guard.api import ActionJudge, Fallback, Judgement, Proposal, Search
 from evofsm.guard.guard import KIND
@@ -442,6 +443,12 @@ def test_settings_of_the_reviser_are_looked_at_where_they_are_set():
     unrevised = Guard.of(Unrevised(IntervalActions(-2.5, 2.5, 0.3)), interval=DT)
     with pytest.raises(AttributeError, match="Unrevised has no mode"):
         unrevised.mode = "shadow"
+
+
+def test_a_reviser_for_decisions_at_another_interval_is_refused():
+    reviser = EnvelopeReviser(ModifiedTimeToCollision(), IntervalActions(-2.5, 2.5, 0.3), 0.25)
+    with pytest.raises(ValueError, match=r"is 0\.1 s, but the reviser was made for .* 0\.25 s"):
+        Guard.of(reviser, interval=0.1)
 
 
 def test_a_machine_of_other_actions_is_refused():

@@ -330,9 +330,11 @@ class Guard:
             raise ValueError(
                 f"the judge has a method learn, but not all of a LearningJudge: it lacks {lacks}"
             )
-        if judge and not math.isclose(judge.dt, self.interval):
-            text = f"the judge was made for decisions every {judge.dt} s"
-            raise ValueError(f"interval is {interval} s, but {text}")
+        for part, of in (("judge", judge), ("reviser", reviser)):
+            dt = getattr(of, "dt", interval)
+            if not math.isclose(dt, self.interval):
+                text = f"the {part} was made for decisions every {dt} s"
+                raise ValueError(f"interval is {interval} s, but {text}")
         if machine is not None and machine.n_actions != self.actions.n_actions:
             counts = f"{machine.n_actions} actions, but the set has {self.actions.n_actions}"
             raise ValueError(f"the machine has {counts}")
