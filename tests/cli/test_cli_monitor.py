@@ -132,6 +132,27 @@ def test_csv_with_a_column_twice_is_refused():
     assert "gap is the name of several columns" in first["error"]
 
 
+@pytest.mark.parametrize("goes_on", [False, True])
+def test_csv_is_read_in_the_units_that_stood_below_the_names_of_the_log(tmp_path, goes_on):
+    """Also without that row; one that says others is right."""
+    log, guard, state = (tmp_path / name for name in ("log.csv", "guard", "state"))
+    names, far = "time,gap,v_follower,v_leader,a_follower", 10.0 / 0.3048
+    rows = [f"{k / 10},{far:.4f},20,20,0" for k in range(40)]
+    log.write_text("\n".join([names, "s,ft,m/s,m/s,m/s²", *rows, ""]))
+    learn = ["learn", str(log), "--guard", str(guard)]
+    assert CliRunner().invoke(application(), learn).exit_code == 0
+    if goes_on:
+        evofsm("--guard", guard, "--state", state)
+        guard = state
+    risks = []
+    for unit, gap in (("", far), ("s,ft,m/s,m/s,m/s²", far), ("s,m,m/s,m/s,m/s²", 10.0)):
+        lines = [names, *[unit] * bool(unit), f"0.0,{gap:.4f},20,15,0"]
+        *_, answer = told(evofsm("--guard", guard, lines=map(str.encode, lines)))
+        risks.append(answer["risk_proposed"])
+    assert risks == pytest.approx([risks[0]] * 3, rel=1e-3)
+    assert risks[0] > 0.02
+
+
 def test_the_audit_log_is_good(tmp_path):
     log, state = tmp_path / "audit.jsonl", tmp_path / "state.evofsm"
     assert evofsm("--audit", log, lines=ROWS).exit_code == 0

@@ -62,6 +62,7 @@ def learn(
     from evofsm.guard import Foresight, Guard
     from evofsm.io import Chunk, episodes_of, read_traces
     from evofsm.io.logs import Noted
+    from evofsm.io.tables import UNITS
 
     learning.check_out(out, "model")
     learning.check_out(guard, "guard", "--guard")
@@ -98,6 +99,7 @@ def learn(
         "files": [{"name": n, "bytes": size} for n, size in zip(files, sizes, strict=True)],
         **{name: counts[name] for name in ("rows", "episodes", "transitions", "failures")},
         "read with": {k: v for k, v in reading.items() if k != "topics"},
+        "units": {name: unit for name, unit in notes.units.items() if UNITS.get(unit, 1.0) != 1.0},
     }
     warnings = learning.warnings_of(notes, columns)
     for warning in warnings:

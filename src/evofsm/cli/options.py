@@ -251,13 +251,16 @@ def reading_of(
     )
 
 
-def read_with(learnt: Path | None) -> dict[str, Any]:
-    """The options with which the log was read that a file is learnt from; none where it is not."""
+def read_with(learnt: Path | None, what: str = "read with") -> dict[str, Any]:
+    """The options with which the log was read that a file is learnt from; none where it is not.
+
+    Or other ``units`` than those of the SI, that columns of it had.
+    """
     from evofsm.store import read_header
 
     if learnt is None or not learnt.is_file():
         return {}
-    return dict(read_header(learnt).provenance.get("read with", {}))
+    return dict(read_header(learnt).provenance.get(what, {}))
 
 
 def typed(given: Mapping[str, Any]) -> str:

@@ -135,6 +135,7 @@ def monitor(
     how: Any = brakes, options.TOLERANCE if tolerance is None else tolerance
     make: Any = partial(guard_of_monitor, interval or _INTERVAL, *how, traffic=traffic)
     notice, reader = assumptions(*how), {**options.read_with(guard or state), **reading}
+    units = options.read_with(guard or state, "units")
     if guard is not None:
         make = partial(load_learning, guard, reader.get("failed"))
         notice = f"assumed: what {guard} was given and has learnt"
@@ -193,9 +194,9 @@ def monitor(
             ways = {"mode": mode, "learn": learn, "tolerance": tolerance, "episode": ends}
             ways["false_a_day"] = false_a_day
             columns = {k: v for k, v in reader.items() if k != "topics"}
-            read_with = {**columns, "observe": observe} if observe else {}
+            log = {"read with": {**columns, "observe": observe} if observe else {}, "units": units}
             settings = {"guard": digest, **columns, **basics, **ways, **system}
-            keeper = State(state, settings, read_with)
+            keeper = State(state, settings, log)
             stack.callback(keeper.close)
         elif learn and not summary:
             warn("nothing of what is learnt is saved; --state FILE saves it")
@@ -207,11 +208,14 @@ def monitor(
         if not (is_log or traffic):
             if observe is None or sentry.variables != VARIABLES:  # cars' may have other names
                 observe = options.quoted(sentry.variables or VARIABLES)
-            slots = Slots(options.reading_of(**{**reader, "observe": observe, "dt": None}))
+            slots = Slots(options.reading_of(**{**reader, "observe": observe, "dt": None}), units)
         decider = Decider(sentry, episode=rows, slots=slots)
         if slots is not None and reader:
             si = "; in JSON all but its column of the time is in the SI" * ("unit" in reader)
             notice += f"; rows are read as in a log: {options.typed(reader)}{si}"
+        if units and slots is not None:
+            told = ", ".join(f"{name} in {unit}" for name, unit in units.items())
+            notice += f"; CSV has {told} as in the guard's log, unless a row of units says others"
         if summary and file is not None:
             from evofsm.cli.monitor.summary import decided_on_lines, decided_on_log, summary_of
 

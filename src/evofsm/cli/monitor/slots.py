@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from hashlib import sha256
 from itertools import zip_longest
 from operator import itemgetter
@@ -22,8 +22,11 @@ _BECOME: dict[str, Any] = {"mean": fmean, "last": itemgetter(-1), "max": max, "m
 class Slots:
     """Puts rows of a step together; those that wait are one when a row of another step comes."""
 
-    def __init__(self, columns: LogColumns | None = None) -> None:
+    def __init__(
+        self, columns: LogColumns | None = None, units: Mapping[str, str] | None = None
+    ) -> None:
         self.columns = columns = columns or LogColumns()
+        self.units = units or {}  #: of columns of CSV, where neither it nor an option tells them
         #: [s], 0 where rows stay as they are; and what the values of a column become.
         self.step, self._how = columns.resample or Resample(0.0)
         self.hole = columns.longest_hole  #: up to which a hole costs no episode [s]
@@ -121,7 +124,8 @@ class CsvRows:
     """Lines of CSV as messages, below one that names the columns; others stay as they are."""
 
     def __init__(self, slots: Slots, variables: Sequence[str], *, acts: bool) -> None:
-        self._columns = columns = slots.columns
+        self._columns, self._usual_units = slots.columns, slots.units
+        columns = self._columns
         self._variables, action = slots.names[: len(variables)], [columns.action] if acts else []
         self._numbers = {*self._variables, *action, *slots.compared}
         if "%" not in columns.units.get(columns.time, ""):
@@ -210,7 +214,7 @@ class CsvRows:
             return True
         numbers = [name for name in dialect.columns if name in self._numbers]
         units = {name: unit for name, unit in self._columns.units.items() if "%" not in unit}
-        units = {**dialect.units, **units_of(units, numbers)}
+        units = {**self._usual_units, **dialect.units, **units_of(units, numbers)}
         self._factors = {name: tables.UNITS.get(units.get(name, ""), 1.0) for name in numbers}
         self._dialect = dialect
         return dialect.n_told == len(below)

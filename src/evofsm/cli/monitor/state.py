@@ -33,14 +33,14 @@ class State:
     """Keeps a monitor in files. Close it after use."""
 
     def __init__(
-        self, path: Path, settings: Mapping[str, Any], read_with: Mapping[str, Any] | None = None
+        self, path: Path, settings: Mapping[str, Any], provenance: Mapping[str, Any] | None = None
     ) -> None:
         self.path = path.resolve()
         self.settings = dict(settings)
         self.failure = ""  #: why nothing is saved; empty as long as it is
         journal = self.path.with_name(f"{self.path.name}.journal")
         self._journal = Journal(journal, "name another file")
-        self._provenance: dict[str, Any] = {"read with": read_with} if read_with else {}
+        self._provenance: dict[str, Any] = dict(provenance or {})
         self._saved: dict[str, Any] = {}  # what stands beside the guard
         self._mark = 0
         self._decider: Decider  # once it has begun
