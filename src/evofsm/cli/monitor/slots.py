@@ -124,16 +124,16 @@ class CsvRows:
     """Lines of CSV as messages, below one that names the columns; others stay as they are."""
 
     def __init__(self, slots: Slots, variables: Sequence[str], *, acts: bool) -> None:
-        self._columns, self._usual_units = slots.columns, slots.units
-        columns = self._columns
-        self._variables, action = slots.names[: len(variables)], [columns.action] if acts else []
-        self._numbers = {*self._variables, *action, *slots.compared}
+        self._columns = columns = slots.columns
+        self._usual_units, actions = slots.units, [columns.action, "proposal"] * acts
+        self._variables = slots.names[: len(variables)]
+        self._numbers = {*self._variables, *actions, *slots.compared}
         if "%" not in columns.units.get(columns.time, ""):
             self._numbers.add(columns.time)
         names = *self._variables, *slots.keys, *columns.time.split(","), "proposal"
         #: What messages call the columns that are read.
         self._called = dict(zip(names, (*variables, *names[len(variables) :]), strict=True))
-        self._called |= dict.fromkeys(action, "proposal")
+        self._called |= dict.fromkeys(actions, "proposal")
         self._called[columns.time] = "time"
         self._count, self._factors = 0, dict[str, float]()
         self._head: list[str] = []  # the line with the names, and those below to the first row
