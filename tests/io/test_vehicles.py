@@ -3,6 +3,7 @@
 import gzip
 import math
 
+import betterosi as osi
 import libsumo
 import numpy as np
 import polars
@@ -83,7 +84,7 @@ def test_variables_may_be_chosen_and_ordered_and_nothing_else(tmp_path):
     assert "gap, v_follower, v_leader" in refusal(path, observe=ObservationEncoder("speed"))
     for asked in ({"action": "accel"}, {"dt": 0.1}, {"episode": ["run"]}, {"failed": "crash"}):
         assert f"cannot be read with --{next(iter(asked))}" in refusal(path, **asked)
-    assert "cannot be read with --unit" in refusal(path, units={"v": "km/h"})
+    assert "cannot be read with --unit: write it in s, m" in refusal(path, units={"v": "km/h"})
 
 
 def test_so_many_waiting_rows_are_handed_on_before_the_pairs_part(tmp_path, monkeypatch):
@@ -341,6 +342,18 @@ def test_who_stands_points_where_it_moved_last_or_where_it_is_said_to(tmp_path):
     assert len(episodes(objects(tmp_path / "b.csv", told, OBJECTS + ",heading"))[0][0]) == 3
 
 
+def test_who_reverses_has_a_negative_speed_where_its_heading_is_told(tmp_path):
+    for speed, leader_speed in ((2, -3), (-2, 0)):
+        cars = ("b", 0, speed), ("a", 40, leader_speed)
+        rows = [
+            (name, t, *along_a_road(2.0, x + v * t, 0), *along_a_road(2.0, v, 0), 4, 1, 2.0)
+            for t in (0.0, 0.1)
+            for name, x, v in cars
+        ]
+        ((observations, _, _),) = episodes(objects(tmp_path / "a.csv", rows, OBJECTS + ",heading"))
+        assert observations[0] == pytest.approx([36.0, speed, leader_speed])
+
+
 @pytest.mark.parametrize(
     ("rows", "said"),
     [
@@ -383,6 +396,40 @@ def test_mcap_is_read_by_its_schema_and_named_where_it_holds_something_else(tmp_
             assert "its schemas are Log, SensorData" in refusal(path)
         else:
             assert_pair(path)
+
+
+@pytest.mark.parametrize("lanes", [(1, 2), (2, 1)])
+def test_in_osi_one_on_several_lanes_leads_on_each_and_a_trailer_follows_nobody(tmp_path, lanes):
+    towing = osi.MovingObject.VehicleClassification(
+        has_trailer=True, trailer_id=osi.Identifier(value=3)
+    )
+    truth = osi.GroundTruth(
+        timestamp=osi.Timestamp(seconds=1),
+        moving_object=[
+            osi.MovingObject(
+                id=osi.Identifier(value=name),
+                base=osi.BaseMoving(
+                    position=osi.Vector3d(x=x, y=y),
+                    velocity=osi.Vector3d(x=20.0),
+                    dimension=osi.Dimension3d(length=length, width=2.0),
+                ),
+                assigned_lane_id=[osi.Identifier(value=lane) for lane in on],
+                vehicle_classification=towing if name == 4 else None,
+            )
+            for name, x, y, length, on in (
+                (1, 0.0, 0.0, 4.0, [1]),
+                (2, 20.0, 1.2, 4.0, lanes),  # cuts in from the lane 2
+                (3, 50.0, 0.0, 12.0, [1]),
+                (4, 57.0, 0.0, 6.0, [1]),
+                (5, 80.0, 3.5, 4.0, [2]),
+            )
+        ],
+    )
+    data = truth.to_binary()
+    (path := tmp_path / "a.osi").write_bytes(len(data).to_bytes(4, "little") + data)
+    (chunk,) = read_traces([str(path)])
+    gaps = dict(zip(chunk.names, chunk.observations[:, 0].round(1).tolist(), strict=True))
+    assert gaps == {"1 behind 2": 16.0, "2 behind 3": 22.0}
 
 
 LEFT_OPEN = {

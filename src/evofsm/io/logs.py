@@ -662,12 +662,12 @@ def _columns_of_pairs(path: str, columns: LogColumns) -> LogColumns:
     options += [f"--action {columns.action}"] if columns.action != ACTION else []
     names = "episode", "dt", "hold", "where", "hole", "resample"
     options += [f"--{name}" for name in names if getattr(columns, name) is not None]
-    options += ["--unit"] * bool(columns.units)
     if columns.no_leader not in (None, "end"):  # who has none is no pair
         options += [f"--no-leader {columns.no_leader}"]
     terms = [] if columns.failed is None else Condition.parse(columns.failed).terms
     if not all(term.of_number and term.column in (*VARIABLES, ACTION) for term in terms):
         options += [f"--failed {columns.failed} (but with 'gap<=0')"]
+    options += ["--unit: write it in s, m and m/s"] * bool(columns.units)  # the last one
     if options:
         raise ValueError(
             f"{path} holds many vehicles (FCD of SUMO, objects, OSI), with a clock and episodes of "

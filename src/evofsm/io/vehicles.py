@@ -14,7 +14,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import chain, islice
+from itertools import chain, islice, starmap
 from typing import Any, NamedTuple, NoReturn
 from xml.parsers import expat
 
@@ -52,17 +52,18 @@ class Vehicle(NamedTuple):
     """Where a vehicle is at one time, and how it moves."""
 
     where: Place
-    lane: str
+    lanes: Sequence[str]
     name: str
     place: complex  #: in the plane [m]; NaN if not told
     heading: complex  #: of length 1; NaN if not told
-    speed: float  #: [m/s]
+    speed: float  #: [m/s], negative where it reverses
     front: float  #: from its place to its front bumper [m]
     rear: float  #: and to the rear one
     width: float  #: [m]
     along: float = math.nan  #: its place along the lane [m], if told; else it is where it points
     lateral: float = math.nan  #: its place across the lane [m], if told
     kind: str = ""
+    is_towed: bool = False
 
 
 #: Time [s], where it stands, and all that is there then: where, and what stands there by its name.
@@ -122,7 +123,11 @@ class PairTable(Table):
                 continue
             before = time
             present: dict[_Pair, array[float]] = {}
-            for pair, numbers in chain.from_iterable(map(self._pairs, lanes)):
+            nearest: dict[str, tuple[float, _Pair, tuple[float, float, float]]] = {}
+            for pair, numbers in chain.from_iterable(starmap(self._pairs, lanes)):
+                found = numbers[0], pair, numbers  # of all lanes that it is on
+                nearest[pair[1]] = min(found, nearest.get(pair[1], found))
+            for _, pair, numbers in nearest.values():
                 rows = open_pairs.pop(pair, None) or array("d")
                 rows.extend((time, *numbers))
                 present[pair] = rows
@@ -137,7 +142,7 @@ class PairTable(Table):
 
     def _lanes(
         self, time: float, cars: Iterable[Vehicle], headings: dict[str, complex]
-    ) -> Iterable[list[Vehicle]]:
+    ) -> Iterable[tuple[str, list[Vehicle]]]:
         """Who is on each lane, once; who does not say where it points does so as before."""
         lanes: defaultdict[str, list[Vehicle]] = defaultdict(list)
         names = set[str]()
@@ -151,10 +156,13 @@ class PairTable(Table):
             if car.heading != car.heading:
                 car = car._replace(heading=headings.get(car.name, car.heading))
             headings[car.name] = car.heading
-            lanes[car.lane].append(car)
-        return [lanes[name] for name in (sorted(lanes) if self.lengths else lanes)]
+            for lane in dict.fromkeys(car.lanes):
+                lanes[lane].append(car)
+        return sorted(lanes.items()) if self.lengths else lanes.items()
 
-    def _pairs(self, lane: list[Vehicle]) -> Iterator[tuple[_Pair, tuple[float, float, float]]]:
+    def _pairs(
+        self, name: str, lane: list[Vehicle]
+    ) -> Iterator[tuple[_Pair, tuple[float, float, float]]]:
         """Each vehicle of a lane and the nearest one ahead, not beside its way nor towards it.
 
         With it come the gap, bumper to bumper [m], and both speeds [m/s].
@@ -163,6 +171,8 @@ class PairTable(Table):
             lane.sort(key=lambda car: (car.along, car.name))
         places = np.array([car.place for car in lane])
         for order, car in enumerate(lane):
+            if car.is_towed:
+                continue
             for leader, along, distance in _ahead(car, lane, order, places):
                 is_told = leader.heading == leader.heading
                 headings = car.heading + (leader.heading if is_told else car.heading)
@@ -175,7 +185,7 @@ class PairTable(Table):
                     gap = distance - (car.front + leader.rear)
                     if self.lengths and gap <= 0.0 and aside > _IN_LINE:
                         self.lengths.overlaps[leader.kind] += 1
-                    yield (car.lane, car.name, leader.name), (gap, car.speed, leader.speed)
+                    yield (name, car.name, leader.name), (gap, car.speed, leader.speed)
                     break
 
 
@@ -189,7 +199,7 @@ def _ahead(
         return
     if len(lane) > _MOST_ON_A_LANE:
         raise ValueError(
-            f"{car.where()}: {len(lane):,} objects on the lane {car.lane[:40]!r} at one time "
+            f"{car.where()}: {len(lane):,} objects on the lane {car.lanes[0][:40]!r} at one time "
             "(rows not sorted by time, or the clock of a coarse step?)"
         )
     apart = places - car.place
@@ -273,7 +283,17 @@ def _car(lengths: VehicleLengths, place: Place, told: Mapping[str, str]) -> Vehi
     kind, heading = told.get("type", ""), cmath.rect(1.0, math.radians(90.0 - angle))
     length, width = lengths.size_of(kind)
     sizes = 0.0, length, width  # its place is that of the front bumper
-    fields = told["lane"], told["id"], complex(x, y), heading, speed, *sizes, along, lateral, kind
+    fields = (
+        (told["lane"],),
+        told["id"],
+        complex(x, y),
+        heading,
+        speed,
+        *sizes,
+        along,
+        lateral,
+        kind,
+    )
     return Vehicle(place, *fields)
 
 
@@ -432,9 +452,13 @@ def _object(place: Place, told: Mapping[str, Any]) -> Vehicle:
     speed, half = math.hypot(vx, vy), 0.5 * length
     if not math.isfinite(heading):
         heading = math.atan2(vy, vx) if speed >= _TURNS_ABOVE else math.nan
+    elif vx * math.cos(heading) + vy * math.sin(heading) < 0.0:
+        speed = -speed
     width = width if width > 0.0 else _USUAL_WIDTH
-    ahead = cmath.rect(1.0, heading)
-    return Vehicle(place, told["lane"], name, complex(x, y), ahead, speed, half, half, width)
+    ahead, lanes = cmath.rect(1.0, heading), told["lane"]
+    where = place, [lanes] if isinstance(lanes, str) else lanes, name, complex(x, y)
+    is_towed = told.get("towed", False)
+    return Vehicle(*where, ahead, speed, half, half, width, is_towed=is_towed)
 
 
 # -- ASAM OSI -------------------------------------------------------------------------------------
@@ -517,21 +541,27 @@ def _moment(osi: Any, place: str, data: bytes, is_view: bool) -> Moment:
     truth = message.global_ground_truth if is_view else message
     stamp = (truth and truth.timestamp) or message.timestamp or osi.Timestamp()
     on_foot = (osi.MovingObject.Type.PEDESTRIAN, osi.MovingObject.Type.ANIMAL)
+    vehicles = truth.moving_object if truth else ()
+    kinds = [vehicle.vehicle_classification for vehicle in vehicles]
+    trailers = {
+        kind.trailer_id.value for kind in kinds if kind and kind.has_trailer and kind.trailer_id
+    }
     entries: list[tuple[Place, Mapping[str, Any]]] = [
-        (lambda: place, _row_of(vehicle))
-        for vehicle in (truth.moving_object if truth else ())
+        (lambda: place, _row_of(vehicle) | {"towed": vehicle.id and vehicle.id.value in trailers})
+        for vehicle in vehicles
         if vehicle.base and vehicle.type not in on_foot
     ]
     return stamp.seconds + 1e-9 * stamp.nanos, lambda: place, entries
 
 
-def _lane(vehicle: Any) -> str:
-    """Where it is; empty where that is not known: it follows nobody, and nobody follows it."""
+def _lanes(vehicle: Any) -> list[str]:
+    """Where it is; none where that is not known: it follows nobody, and nobody follows it."""
     classification = vehicle.moving_object_classification
     lanes = (classification and classification.assigned_lane_id) or vehicle.assigned_lane_id
     if lanes or not (classification and classification.logical_lane_assignment):
-        return str(lanes[0].value) if lanes else ""
-    return f"logical {classification.logical_lane_assignment[0].assigned_lane_id.value}"
+        return [str(lane.value) for lane in lanes]
+    lanes = [one.assigned_lane_id for one in classification.logical_lane_assignment]
+    return [f"logical {lane.value}" for lane in lanes]
 
 
 def _row_of(vehicle: Any) -> dict[str, Any]:
@@ -542,5 +572,5 @@ def _row_of(vehicle: Any) -> dict[str, Any]:
     length, width = (size.length, size.width) if size else unknown
     heading = base.orientation.yaw if base.orientation else math.nan
     name = str(vehicle.id.value) if vehicle.id else "without an id"
-    row = {"id": name, "lane": _lane(vehicle), "x": x, "y": y, "vx": vx, "vy": vy}
+    row = {"id": name, "lane": _lanes(vehicle), "x": x, "y": y, "vx": vx, "vy": vy}
     return row | {"length": length, "width": width, "heading": heading}
