@@ -35,24 +35,24 @@ DECELS = st.floats(1.0, 9.0)
 LAGS = st.one_of(st.just(0.0), st.floats(0.0, 1.0))
 
 
-def critical(gap, speed, leader_speed, action, *, before=0.0, decel=4.0, lag=0.0):
+def critical(gap, speed, leader_speed, action, *, before=0.0, decel=4.0, lag=0.0, dt=DT):
     answer = np.empty(1)
     observation = np.array([gap, speed, leader_speed])
-    body = Follower(decel, lag, MARGIN, before, DT)
+    body = Follower(decel, lag, MARGIN, before, dt)
     critical_decelerations(observation, np.array([action]), body, answer)
     return float(answer[0])
 
 
 @numba.njit
-def smallest_gap(gap, speed, leader_speed, action, before, decel, lag, leader_decel):
+def smallest_gap(gap, speed, leader_speed, action, before, decel, lag, leader_decel, dt=DT):
     """Driven out in steps of 1 ms: the old command, the new one, and full braking."""
     step = 1e-3
     smallest, tick = gap, 0
     while True:
         time = tick * step
-        if time < lag * DT:
+        if time < lag * dt:
             command = before
-        elif time < (1.0 + lag) * DT:
+        elif time < (1.0 + lag) * dt:
             command = action
         else:
             command = -decel
@@ -70,17 +70,20 @@ def smallest_gap(gap, speed, leader_speed, action, before, decel, lag, leader_de
 
 
 @settings(max_examples=400)
-@given(GAPS, SPEEDS, SPEEDS, ACTIONS, ACTIONS, DECELS, LAGS)
-@example(5.0, 20.0, 25.0, -2.0, -2.0, 2.0, 0.0)  # a faster leader who brakes harder
+@given(GAPS, SPEEDS, SPEEDS, ACTIONS, ACTIONS, DECELS, LAGS, st.sampled_from([DT, 2.0]))
+@example(5.0, 20.0, 25.0, -2.0, -2.0, 2.0, 0.0, DT)  # a faster leader who brakes harder
+@example(3.0, 20.0, 15.0, -4.0, 0.0, 9.0, 0.0, 2.0)  # nearest within an interval
 def test_the_critical_deceleration_agrees_with_driving_it_out(
-    gap, speed, leader_speed, action, before, decel, lag
+    gap, speed, leader_speed, action, before, decel, lag, dt
 ):
-    hardest = critical(gap, speed, leader_speed, action, before=before, decel=decel, lag=lag)
+    lag = lag if dt == DT else 0.0
+    told = {"before": before, "decel": decel, "lag": lag}
+    hardest = critical(gap, speed, leader_speed, action, **told, dt=dt)
     stays = speed == 0.0 and action <= 0.0 and (before <= 0.0 or lag == 0.0)
     kept = 0.0 if stays else MARGIN
 
     def left(leader_decel):
-        return smallest_gap(gap, speed, leader_speed, action, before, decel, lag, leader_decel)
+        return smallest_gap(gap, speed, leader_speed, action, before, decel, lag, leader_decel, dt)
 
     assert 0.0 <= hardest <= HARDEST
     if hardest > DECEL_TOLERANCE:

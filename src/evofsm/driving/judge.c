@@ -124,7 +124,14 @@ static int survives(const double here[3], double acceleration, double before, do
     return here[0] > 0.0;
   }
   for (t = 0; t < 2 && gap > 0.0 && !(asked == caution && last == caution); t++) {
-    const double driven = drive_on(&speed, LAG * last + (1.0 - LAG) * asked, EVOFSM_INTERVAL);
+    const double mean = LAG * last + (1.0 - LAG) * asked, slowing = -leader_decel - mean;
+    double driven;
+    closing = speed - leader;
+    if (closing > 0.0 && closing < slowing * EVOFSM_INTERVAL &&
+        leader * slowing > leader_decel * closing && gap <= 0.5 * closing * closing / slowing) {
+      return 0;
+    }
+    driven = drive_on(&speed, mean, EVOFSM_INTERVAL);
     gap += drive_on(&leader, -leader_decel, EVOFSM_INTERVAL) - driven;
     last = asked;
     asked = caution;

@@ -114,6 +114,11 @@ def survives(
         if gap <= 0.0 or (demand == caution and last == caution):
             break
         mean = body.lag * last + (1.0 - body.lag) * demand
+        closing_speed, slowing = speed - leader_speed, -leader_decel - mean
+        if 0.0 < closing_speed < slowing * body.dt:  # it is nearest within the interval, if ...
+            leader_moves = leader_speed * slowing > leader_decel * closing_speed
+            if leader_moves and gap <= 0.5 * closing_speed * closing_speed / slowing:
+                return False
         distance, speed = _drive_on(speed, mean, body.dt)
         leader_distance, leader_speed = _drive_on(leader_speed, -leader_decel, body.dt)
         gap += leader_distance - distance
