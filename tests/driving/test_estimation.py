@@ -100,7 +100,7 @@ def test_gentle_braking_does_not_water_down_what_hard_braking_may_be():
     assert manoeuvres.gentle == 400
 
 
-@pytest.mark.parametrize("dt", [0.1, 0.25, 0.5])
+@pytest.mark.parametrize("dt", [0.1, 0.25, 0.5, 1.0])
 @given(decel=st.floats(1.2, 12.0), speed=st.floats(8.0, 40.0))
 def test_constant_brakes_are_measured_as_they_are(dt, decel, speed):
     steps = int(speed / (decel * dt))
@@ -113,7 +113,15 @@ def test_constant_brakes_are_measured_as_they_are(dt, decel, speed):
     assert [one for one in told if one is not None] == [pytest.approx(decel)]
 
 
-@pytest.mark.parametrize("dt", [0.1, 0.25])
+def test_with_a_row_every_second_short_emergency_brakes_are_seen():
+    for decel, speed in ((9.0, 17.5), (6.0, 12.5), (8.0, 15.0)):
+        watch = BrakeWatch(1.0)
+        speeds = np.maximum(speed - np.maximum(decel * (np.arange(9.0) - 3.0), 0.0), 0.0)
+        told = [watch.see(30.0, now, now) for now in speeds]
+        assert [one for one in told if one is not None] == [pytest.approx(decel)]
+
+
+@pytest.mark.parametrize("dt", [0.1, 0.25, 1.0])
 @pytest.mark.parametrize("speed", [0.0, 20.0])
 @pytest.mark.parametrize(("deviation", "known"), [(0.2, 0.0), (0.5, 0.7)])
 def test_noise_is_no_manoeuvre(dt, speed, deviation, known):

@@ -128,7 +128,8 @@ class BrakeWatch:
     def __init__(self, dt: float) -> None:
         self.dt = positive("dt", dt)
         self._recently = max(1, round(_RECENT / dt))
-        self._shortest = max(self._recently + 1, round(_SHORTEST_BRAKING / dt))
+        least = self._recently + (dt < _SHORTEST_BRAKING)  # of long steps one says it
+        self._shortest = max(least, round(_SHORTEST_BRAKING / dt))
         self._window = max(self._shortest, round(_WINDOW / dt))
         self.clear()
 
