@@ -176,13 +176,15 @@ def along_a_road(turned, along, across):
     return along * c - across * s, along * s + across * c
 
 
-@pytest.mark.parametrize("told", [("posLat",), ("x", "y", "angle")])
+@pytest.mark.parametrize("told", [("posLat",), ("x", "y", "angle"), ("x", "y", "angle", "geo")])
 @pytest.mark.parametrize("ending", ["xml", "csv"])
 def test_who_is_beside_is_nobody_s_leader_in_fcd(tmp_path, told, ending):
     seen = []
     for name, (along, across) in ACROSS.items():
         x, y = along_a_road(math.radians(60.0), along, across)
-        places = {"posLat": across, "x": x, "y": y, "angle": 30.0}
+        if "geo" in told:
+            x, y = 13.0 + x / 111_195.0 / math.cos(math.radians(52.0)), 52.0 + y / 111_195.0
+        places = {"posLat": across, "x": x, "y": y, "angle": 30.0, "geo": 1}
         kind = "truck" if name == "truck" else "bike"
         seen.append(dict(zip(FIELDS, (name, "e", along, 5.0, kind), strict=True)))
         seen[-1] |= {place: places[place] for place in told}

@@ -178,7 +178,11 @@ class PairTable(Table):
                 headings = car.heading + (leader.heading if is_told else car.heading)
                 aside = abs(leader.lateral - car.lateral)
                 if aside != aside and along < _BESIDE_WITHIN:  # across the way, as both point
-                    aside = abs(((leader.place - car.place) * headings.conjugate()).imag)
+                    apart = leader.place - car.place
+                    if abs(apart) < 0.01 * along:  # in degrees (--fcd-output.geo)
+                        east = apart.real * math.cos(math.radians(car.place.imag))
+                        apart = complex(east, apart.imag) * _DEGREE
+                    aside = abs((apart * headings.conjugate()).imag)
                     aside /= abs(headings) + 1e-9
                 is_oncoming = abs(headings) < 1.0
                 if not (is_oncoming or aside >= 0.5 * (car.width + leader.width)):
@@ -230,6 +234,7 @@ _LONGEST_TAG, _DEEPEST = 1_000_000, 16
 _USUAL_LENGTH, _USUAL_WIDTH = 5.0, 1.8
 # Who is less aside is in line; and who is that near may be beside by its place in the plane [m].
 _IN_LINE, _BESIDE_WITHIN = 0.4, 20.0
+_DEGREE = 111_195.0  # of latitude [m]
 # What the parser says where a file ends early.
 _CUT = {expat.errors.XML_ERROR_NO_ELEMENTS, expat.errors.XML_ERROR_UNCLOSED_TOKEN}
 _CUT |= {expat.errors.XML_ERROR_PARTIAL_CHAR}
