@@ -332,6 +332,14 @@ def test_the_leader_is_the_nearest_one_ahead_on_the_same_lane(tmp_path):
     assert again[1][0].tolist() == found[1][0].tolist()
 
 
+def test_a_name_that_is_used_again_at_once_begins_an_episode(tmp_path):
+    rows = [("b", k / 10, 2.0 * k, 0, 20, 0, 4, 1) for k in range(10)]
+    rows += [("a", t, x + (40 if t < 0.5 else 90), *rest) for _, t, x, *rest in rows]
+    rows.sort(key=lambda row: row[1])
+    found = episodes(objects(tmp_path / "a.csv", rows))
+    assert [one[0].round(6).tolist() for one in found] == [[[gap, 20, 20]] * 5 for gap in (36, 86)]
+
+
 def test_who_stands_points_where_it_moved_last_or_where_it_is_said_to(tmp_path):
     rows = [
         row
@@ -400,34 +408,21 @@ def test_mcap_is_read_by_its_schema_and_named_where_it_holds_something_else(tmp_
             assert_pair(path)
 
 
-@pytest.mark.parametrize("lanes", [(1, 2), (2, 1)])
+@pytest.mark.parametrize("lanes", [[1, 2], [2, 1]])
 def test_in_osi_one_on_several_lanes_leads_on_each_and_a_trailer_follows_nobody(tmp_path, lanes):
-    towing = osi.MovingObject.VehicleClassification(
-        has_trailer=True, trailer_id=osi.Identifier(value=3)
-    )
-    truth = osi.GroundTruth(
-        timestamp=osi.Timestamp(seconds=1),
-        moving_object=[
-            osi.MovingObject(
-                id=osi.Identifier(value=name),
-                base=osi.BaseMoving(
-                    position=osi.Vector3d(x=x, y=y),
-                    velocity=osi.Vector3d(x=20.0),
-                    dimension=osi.Dimension3d(length=length, width=2.0),
-                ),
-                assigned_lane_id=[osi.Identifier(value=lane) for lane in on],
-                vehicle_classification=towing if name == 4 else None,
-            )
-            for name, x, y, length, on in (
-                (1, 0.0, 0.0, 4.0, [1]),
-                (2, 20.0, 1.2, 4.0, lanes),  # cuts in from the lane 2
-                (3, 50.0, 0.0, 12.0, [1]),
-                (4, 57.0, 0.0, 6.0, [1]),
-                (5, 80.0, 3.5, 4.0, [2]),
-            )
-        ],
-    )
-    data = truth.to_binary()
+    def moving(name, x, length, on, y=0.0, **others):
+        size = osi.Dimension3d(length=length, width=2.0)
+        where, speed = osi.Vector3d(x=x, y=y), osi.Vector3d(x=20.0)
+        base = osi.BaseMoving(position=where, velocity=speed, dimension=size)
+        ids = [osi.Identifier(value=number) for number in (name, *on)]
+        return osi.MovingObject(id=ids[0], base=base, assigned_lane_id=ids[1:], **others)
+
+    tows = {"has_trailer": True, "trailer_id": osi.Identifier(value=3)}
+    truck = {"vehicle_classification": osi.MovingObject.VehicleClassification(**tows)}
+    cars = [moving(1, 0.0, 4.0, [1]), moving(2, 20.0, 4.0, lanes, y=1.2)]  # which cuts in
+    cars += [moving(3, 50.0, 12.0, [1]), moving(4, 57.0, 6.0, [1], **truck)]
+    cars += [moving(5, 80.0, 4.0, [2], y=3.5)]
+    data = osi.GroundTruth(timestamp=osi.Timestamp(seconds=1), moving_object=cars).to_binary()
     (path := tmp_path / "a.osi").write_bytes(len(data).to_bytes(4, "little") + data)
     (chunk,) = read_traces([str(path)])
     gaps = dict(zip(chunk.names, chunk.observations[:, 0].round(1).tolist(), strict=True))

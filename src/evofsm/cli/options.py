@@ -252,10 +252,7 @@ def reading_of(
 
 
 def read_with(learnt: Path | None, what: str = "read with") -> dict[str, Any]:
-    """The options with which the log was read that a file is learnt from; none where it is not.
-
-    Or other ``units`` than those of the SI, that columns of it had.
-    """
+    """The options with which the log was read that a file is learnt from, or ``units`` in it."""
     from evofsm.store import read_header
 
     if learnt is None or not learnt.is_file():

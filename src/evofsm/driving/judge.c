@@ -124,11 +124,11 @@ static int survives(const double here[3], double acceleration, double before, do
     return here[0] > 0.0;
   }
   for (t = 0; t < 2 && gap > 0.0 && !(asked == caution && last == caution); t++) {
-    const double mean = LAG * last + (1.0 - LAG) * asked, slowing = -leader_decel - mean;
+    const double mean = LAG * last + (1.0 - LAG) * asked, gain = -leader_decel - mean;
     double driven;
     closing = speed - leader;
-    if (closing > 0.0 && closing < slowing * EVOFSM_INTERVAL &&
-        leader * slowing > leader_decel * closing && gap <= 0.5 * closing * closing / slowing) {
+    if (closing > 0.0 && closing < gain * EVOFSM_INTERVAL &&
+        leader * gain > leader_decel * closing && gap <= 0.5 * closing * closing / gain) {
       return 0;
     }
     driven = drive_on(&speed, mean, EVOFSM_INTERVAL);

@@ -114,10 +114,10 @@ def survives(
         if gap <= 0.0 or (demand == caution and last == caution):
             break
         mean = body.lag * last + (1.0 - body.lag) * demand
-        closing_speed, slowing = speed - leader_speed, -leader_decel - mean
-        if 0.0 < closing_speed < slowing * body.dt:  # it is nearest within the interval, if ...
-            leader_moves = leader_speed * slowing > leader_decel * closing_speed
-            if leader_moves and gap <= 0.5 * closing_speed * closing_speed / slowing:
+        closing_speed, gain = speed - leader_speed, -leader_decel - mean
+        if 0.0 < closing_speed < gain * body.dt:  # it is nearest within the interval, if ...
+            leader_moves = leader_speed * gain > leader_decel * closing_speed
+            if leader_moves and gap <= 0.5 * closing_speed * closing_speed / gain:
                 return False
         distance, speed = _drive_on(speed, mean, body.dt)
         leader_distance, leader_speed = _drive_on(leader_speed, -leader_decel, body.dt)

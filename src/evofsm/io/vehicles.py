@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evofsm.driving.naming import VARIABLES
+from evofsm.driving.rehearsal import Three
 from evofsm.extras import needs
 from evofsm.io import tables
 from evofsm.io.tables import Piece, Skips, Source, Table, Wanted, explained, in_row
@@ -33,6 +34,7 @@ COLUMNS = ("time", *VARIABLES, ACTION)  #: what is known of a pair at one time
 _ROWS_AT_ONCE = 8192
 # Rows that may wait before all are handed on, of 32 bytes each; a pair that is cut loses one step.
 _MOST_WAITING = 1_000_000
+_JUMP = 3.0  # by which a gap changes more [m], and a name is another vehicle's
 _MOST_ON_A_LANE = 1000  # more at one time are no recording of a road, and take long
 
 # What is said where nothing is on a lane.
@@ -123,12 +125,17 @@ class PairTable(Table):
                 continue
             before = time
             present: dict[_Pair, array[float]] = {}
-            nearest: dict[str, tuple[float, _Pair, tuple[float, float, float]]] = {}
+            nearest: dict[str, tuple[float, _Pair, Three]] = {}
             for pair, numbers in chain.from_iterable(starmap(self._pairs, lanes)):
-                found = numbers[0], pair, numbers  # of all lanes that it is on
-                nearest[pair[1]] = min(found, nearest.get(pair[1], found))
+                entry = numbers[0], pair, numbers  # of all lanes that it is on
+                nearest[pair[1]] = min(entry, nearest.get(pair[1], entry))
             for _, pair, numbers in nearest.values():
                 rows = open_pairs.pop(pair, None) or array("d")
+                if rows:  # how far both can have driven since then
+                    way = (time - rows[-4]) * sum(map(abs, (*numbers[1:], *rows[-2:])))
+                    if abs(numbers[0] - rows[-3]) > _JUMP + way:
+                        yield pair, rows
+                        rows = array("d")
                 rows.extend((time, *numbers))
                 present[pair] = rows
             yield from open_pairs.items()  # who has parted
@@ -160,9 +167,7 @@ class PairTable(Table):
                 lanes[lane].append(car)
         return sorted(lanes.items()) if self.lengths else lanes.items()
 
-    def _pairs(
-        self, name: str, lane: list[Vehicle]
-    ) -> Iterator[tuple[_Pair, tuple[float, float, float]]]:
+    def _pairs(self, name: str, lane: list[Vehicle]) -> Iterator[tuple[_Pair, Three]]:
         """Each vehicle of a lane and the nearest one ahead, not beside its way nor towards it.
 
         With it come the gap, bumper to bumper [m], and both speeds [m/s].
@@ -462,8 +467,7 @@ def _object(place: Place, told: Mapping[str, Any]) -> Vehicle:
     width = width if width > 0.0 else _USUAL_WIDTH
     ahead, lanes = cmath.rect(1.0, heading), told["lane"]
     where = place, [lanes] if isinstance(lanes, str) else lanes, name, complex(x, y)
-    is_towed = told.get("towed", False)
-    return Vehicle(*where, ahead, speed, half, half, width, is_towed=is_towed)
+    return Vehicle(*where, ahead, speed, half, half, width, is_towed=told.get("towed", False))
 
 
 # -- ASAM OSI -------------------------------------------------------------------------------------
@@ -565,7 +569,7 @@ def _lanes(vehicle: Any) -> list[str]:
     lanes = (classification and classification.assigned_lane_id) or vehicle.assigned_lane_id
     if lanes or not (classification and classification.logical_lane_assignment):
         return [str(lane.value) for lane in lanes]
-    lanes = [one.assigned_lane_id for one in classification.logical_lane_assignment]
+    lanes = [entry.assigned_lane_id for entry in classification.logical_lane_assignment]
     return [f"logical {lane.value}" for lane in lanes]
 
 

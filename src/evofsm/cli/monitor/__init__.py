@@ -214,8 +214,8 @@ def monitor(
             si = "; in JSON all but its column of the time is in the SI" * ("unit" in reader)
             notice += f"; rows are read as in a log: {options.typed(reader)}{si}"
         if units and slots is not None:
-            told = ", ".join(f"{name} in {unit}" for name, unit in units.items())
-            notice += f"; CSV has {told} as in the guard's log, unless a row of units says others"
+            texts = ", ".join(f"{name} in {unit}" for name, unit in units.items())
+            notice += f"; CSV has {texts} as in the guard's log, unless a row of units says others"
         if summary and file is not None:
             from evofsm.cli.monitor.summary import decided_on_lines, decided_on_log, summary_of
 
