@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from evofsm.guard import ActionReviser, Choices, Foresight, Guard
+from evofsm.guard import ActionReviser, AuditLog, Choices, Foresight, Guard
 from evofsm.guard.foresight import RATES, Runs
 
 DT, HORIZON = 60.0, 1200.0
@@ -208,3 +208,17 @@ def test_an_episode_of_which_nothing_was_seen_ends_and_teaches_nothing():
     guard = Guard.of(ActionReviser(judge, Choices(1)), interval=DT, judge=judge)
     guard.end()
     assert not len(judge.log.starts)
+
+
+def test_an_end_that_the_audit_log_refuses_is_learnt_once_when_it_is_made_again(tmp_path, full_at):
+    judge = Foresight.from_zero(dt=DT, names=NAMES)
+    guard = Guard.of(ActionReviser(judge, Choices(1)), interval=DT, judge=judge)
+    for k in range(4):
+        with AuditLog(tmp_path / "log") as guard.audit:
+            for heat in range(20):
+                guard.decide([heat, 0.0], 0)
+            with full_at(0), pytest.raises(OSError, match="ends with record"):
+                guard.end(failed=True, observation=[20.0, 0.0])
+        guard.audit = None
+        guard.end(failed=True, observation=[20.0, 0.0])
+        assert judge.log.lengths.tolist() == [21] * (k + 1)

@@ -29,6 +29,7 @@ from evofsm import store
 from evofsm.fsm.kernels import compiled, kernel
 from evofsm.fsm.naming import Labels, in_a_line
 from evofsm.fsm.proportions import wilson_bounds
+from evofsm.fsm.sharing import Rollback
 from evofsm.fsm.validation import positive, refuse_unusable
 from evofsm.guard.actions import Action
 from evofsm.guard.api import Fallback, Judgement, LearningJudge, Search, Situation
@@ -651,6 +652,16 @@ class Foresight(LearningJudge):
                 self.held_out, self._learnt = new.held_out, count
             self.log = log
         self._seen = []
+
+    def savepoint(self) -> Rollback:
+        """What takes back all that it learns from now on."""
+        attributes, count = {**vars(self)}, len(self._seen)
+
+        def rollback() -> None:
+            vars(self).update(attributes)
+            del self._seen[count:]
+
+        return rollback
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write what was learnt to a file, with what it learnt from, for people (`provenance`)."""
