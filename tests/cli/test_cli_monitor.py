@@ -174,6 +174,14 @@ def test_the_audit_log_is_good(tmp_path):
     assert found.contents[:3] == (1, 2, 52)
 
 
+def test_the_audit_log_of_alarms_that_go_on_across_holes_is_good(tmp_path):
+    log, times = tmp_path / "audit.jsonl", (*range(30), *range(50, 101))
+    rows = [json.dumps({"time": t, "heat": t}).encode() for t in times]
+    system = ("--observe", "heat", "--action", "", "--interval", 1, "--failed", "heat>=100")
+    assert evofsm(*system, "--hole", "30s", "--audit", log, lines=rows).exit_code == 0
+    assert (audit(log).is_good, audit(log).replayed) == (True, 80)
+
+
 def numbers_of(text):
     """The cells of each line that begins with a number."""
     cells = [one.split() for one in text.splitlines()]

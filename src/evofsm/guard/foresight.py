@@ -86,6 +86,7 @@ KIND = Kind(
     {
         **{"dt": SIZE, "horizon": FROM_1, "hold": FROM_1, "names": list[str], "units": list[str]},
         **{"learns": bool, "asked": SIZE._replace(optional=True), "stated": SIZE},
+        "bridges": SIZE._replace(least=0.0, optional=True),
     },
 )
 
@@ -183,10 +184,11 @@ class Foresight(LearningJudge):
         asked: float | None = None,
         stated: float = RATE,
         days: float = math.nan,
+        bridges: float | None = None,
     ) -> None:
         self.dt = positive("dt", dt)
         self.horizon, self.hold = horizon, hold  #: [rows]
-        self.bridges = 0.0  #: longest hole in time that it goes on across, as in a log [s]
+        self.bridges = bridges or 0.0  #: longest hole that it goes on across, as in a log [s]
         self.forms, self.limits = forms, limits
         #: (rates, 4) of each of `RATES`, the worse of cross-validated and of what it learnt from:
         #: failures foreseen, false alarms, failures; and its kind
@@ -668,7 +670,7 @@ class Foresight(LearningJudge):
         log = _nothing(0) if self.log is None else self.log
         arrays = {name: getattr(self, name) for name in ("forms", "limits", "held_out")}
         arrays |= {name: np.asarray(values, np.float64) for name, values in log._asdict().items()}
-        names = "dt", "horizon", "hold", "asked", "stated"
+        names = "dt", "horizon", "hold", "asked", "stated", "bridges"
         settings = {name: getattr(self, name) for name in names}
         settings["learns"] = self.log is not None
         settings |= {name: list(getattr(self.labels, name)) for name in ("names", "units")}
