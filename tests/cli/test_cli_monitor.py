@@ -100,13 +100,15 @@ def test_a_file_is_taken_in_once_and_as_it_grows_what_is_new_of_it(tmp_path):
     names = "time,gap,v_follower,v_leader,a_follower"
     rows = [",".join(map(str, row.values())) for row in closing_in(40)]
 
-    def answers(file, *lines):
-        file.write_text("\n".join([names, *lines]))
+    def answers(file, *lines, half=""):
+        file.write_text("\n".join([names, *lines, half]))
         result = evofsm(file, "--learn", "--state", state)
+        assert ("no line end behind it, and may be cut off" in result.stdout) == bool(half)
         assert result.exit_code == 0, result.stderr
         return [one["n"] for one in told(result)], result.stderr
 
-    assert answers(log, *rows[:30])[0] == [0, *range(1, 31)]
+    seen, _ = answers(log, *rows[:30], half=rows[30][:-1])  # a row that is still being written
+    assert seen == [0, *range(1, 31), 30]
     again, said = answers(log, *rows[:30])
     assert (again, f"{log} was read before, up to line 31" in said) == ([], True)
     assert answers(log, *rows)[0] == [*range(31, 41)]

@@ -237,7 +237,7 @@ def test_local_time_of_irregular_rows_runs_on_where_summer_time_changes(evofsm, 
         at += timedelta(seconds=5 + chance.uniform(-3, 3) + 30 * (chance.random() < 0.02))
         local = at.astimezone(ZoneInfo("Europe/Berlin"))
         rows.append(f"{local:%d.%m.%Y %H:%M:%S};{k % 9};{int(k == 1400)}")
-    Path("night.csv").write_text("\n".join(["Zeit;heat;trip", *rows]))
+    Path("night.csv").write_text("\n".join(["Zeit;heat;trip", *rows, ""]))
     assert f"ends or begins 2025-{month}" in evofsm("learn", "night.csv").stdout.replace(
         "-03", "-3"
     )
@@ -253,7 +253,7 @@ def test_local_time_of_irregular_rows_runs_on_where_summer_time_changes(evofsm, 
     assert (hours, ran // 3600) == ((1, 1) if month == 10 else (-1, 3))
     zoned = f"{local:%Y-%m-%dT%H:%M:%S}+01:00;4;0"
     Path("night.csv").write_text(
-        "\n".join(["Zeit;heat;trip", *rows[:2], zoned, '{"end": true}', zoned])
+        "\n".join(["Zeit;heat;trip", *rows[:2], zoned, '{"end": true}', zoned, ""])
     )
     *_, other, _, again = evofsm("monitor", "night.csv", *begun).stdout.splitlines()
     assert "line 4: is no local time, unlike that of the row before; all have" in other
@@ -308,7 +308,7 @@ def test_live_rows_stand_as_in_the_log_and_what_cannot_be_compared_is_refused(ev
 
     def answers(*rows):
         lines = [row if isinstance(row, str) else json.dumps(row) for row in rows]
-        Path("rows.jsonl").write_text("\n".join(lines))
+        Path("rows.jsonl").write_text("\n".join([*lines, ""]))
         told = evofsm("monitor", "rows.jsonl", *begun)
         return [json.loads(line) for line in told.stdout.splitlines()]
 

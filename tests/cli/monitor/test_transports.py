@@ -71,6 +71,8 @@ def test_a_pipe_is_answered_line_by_line_whatever_comes_between(plain):
     answers = answered(b"".join(one + b"\n" + row for one, row in pairs))
     assert answers[1::2] == plain
     assert {one["kind"] for one in answers[::2]} == {"error"}
+    cut = answered(b"time,gap,v_follower,v_leader,a_follower\n0,30,20,20,0\n0.1,30,20,20,-0")
+    assert [one["kind"] for one in cut] == ["waiting", "decision", "error"]
 
 
 @pytest.mark.parametrize("size", [53, 1000, 1 << 20])
@@ -84,7 +86,7 @@ def test_lines_are_the_same_however_they_are_cut(plain, size):
 
 def test_it_ends_after_the_message_under_way_however_many_came_at_once(monkeypatch):
     server = Server(Decider(guard_of_monitor(0.1, 6.0)))
-    monkeypatch.setattr(server.decider, "answer", lambda line: time.sleep(0.02) or {})
+    monkeypatch.setattr(server.decider, "answer", lambda *_, **__: time.sleep(0.02) or {})
     threading.Timer(0.3, os.kill, [os.getpid(), signal.SIGINT]).start()
     begun = time.monotonic()
     server.run(Stream(Pieces(b"x\n" * 5000), io.BytesIO()))

@@ -92,13 +92,14 @@ class Decider:
             twin.decide(observation + 0.1 * k * (not self.form.scenes), None)
         twin.end(observation=observation)
 
-    def answer(self, line: bytes) -> Answer:
+    def answer(self, line: bytes, *, is_cut: bool = False) -> Answer:
         """What is answered to a line: a decision, an end, or an error that names the key.
 
-        Messages that are sent again, as after a connection was lost, get the answers of before.
+        Messages that are sent again, as after a connection was lost, get the answers of before. One
+        of CSV that may be cut off, as it has no line end, is refused.
         """
         try:
-            if (body := self.csv.read(line)) is None:
+            if (body := self.csv.read(line, is_cut=is_cut)) is None:
                 return self._of("waiting", alarm=self._alarm, reason=messages.NO_ROW)
             message = self._running(self.form.read(body))
             self._next = self._sent_before(message)

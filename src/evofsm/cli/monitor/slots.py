@@ -145,12 +145,14 @@ class CsvRows:
         self.place, self.in_csv = "", False  #: of a line, as what is said of it begins
         self.heard = ""  #: digest of all lines so far
 
-    def read(self, line: bytes) -> bytes | dict[str, Any] | None:
+    def read(self, line: bytes, *, is_cut: bool = False) -> bytes | dict[str, Any] | None:
         """The keys of a row, or JSON as it is; None of names of columns, a title or units."""
         self._count += 1
-        self.heard = sha256(self.heard.encode() + line[:LONGEST]).hexdigest()
         self.place, self.in_csv = f"line {self._count}: ", False
         begin = line.lstrip(b"\xef\xbb\xbf \t")[:1]
+        if is_cut and begin not in (b"{", b""):  # a number would still be one
+            raise MessageError("line", "has no line end behind it, and may be cut off")
+        self.heard = sha256(self.heard.encode() + line[:LONGEST]).hexdigest()
         self._may_be_title &= begin != b"{" and self._count < Dialect.most_above
         if begin in (b"{", b""):
             return None if self._may_be_title else line

@@ -95,7 +95,8 @@ def decided_on_log(decider: Decider, episodes: Iterable[Chunk]) -> Answers:
 def decided_on_lines(decider: Decider, file: Path) -> Answers:
     """The answers to messages; of those that are refused, the error."""
     for line in lines(file, _LONGEST_MESSAGE):
-        before, answer = decider.n, decider.answer(line.rstrip(b"\r\n"))
+        message, before = line.rstrip(b"\r\n"), decider.n
+        answer = decider.answer(message, is_cut=not line.endswith(b"\n"))
         row = decider.decided_on if decider.n > before else None  # sent again, it counts once
         if "last" in answer:
             yield answer["last"], row

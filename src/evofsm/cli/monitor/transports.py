@@ -52,16 +52,17 @@ class Server:
         self._over, self._ends = threading.Event(), False
         self._failure: Exception | None = None
 
-    def answer(self, lines: Iterable[bytes]) -> bytes:
+    def answer(self, lines: Iterable[bytes], *, is_cut: bool = False) -> bytes:
         """What is answered to lines, each with an end."""
         with self._turn:
             going_on = takewhile(lambda _: not self._ends, lines)
-            answers = b"".join([self._line(self.decider.answer(line)) for line in going_on])
+            replies = (self.decider.answer(line, is_cut=is_cut) for line in going_on)
+            answers = b"".join(map(self._line, replies))
             self._heard = time.monotonic()
         return answers
 
     def converse(self, read: Callable[[int], bytes], write: Callable[[bytes], object]) -> None:
-        """Answer the lines of a stream to its end; one that is too long is cut off, and refused.
+        """Answer the lines of a stream to its end; one that is too long is refused.
 
         Each is answered before the next is decided on: of those that were and nobody heard of, as
         it is killed, there are never more than are known again when they are sent again.
@@ -69,10 +70,12 @@ class Server:
         fragment, data = b"", b"\n"
         while data:
             data = read(_CHUNK)
-            *whole, fragment = (fragment + (data or b"\n" * bool(fragment))).split(b"\n")
+            *whole, fragment = (fragment + data).split(b"\n")
             fragment = fragment[: LONGEST + 1]  # however long it gets
             for line in whole:
                 write(self.answer([line.removesuffix(b"\r")]))
+        if fragment:
+            write(self.answer([fragment.removesuffix(b"\r")], is_cut=True))
 
     def answer_packet(self, data: bytes) -> bytes:
         """What is answered to some lines that came at once."""
