@@ -147,6 +147,17 @@ def test_a_socket_serves_peers_that_come_vanish_and_send_junk(tmp_path, plain):
     assert not path.exists()
 
 
+def test_peers_name_their_columns_each_for_itself(tmp_path):
+    path = tmp_path / "monitor.sock"
+    with served(SocketTransport(path)), connected(path) as one, connected(path) as other:
+        for peer, names in (one, b"time,gap"), (other, b"gap,time"):
+            title = asked(peer, names + b",v_follower,v_leader,a_follower\n")
+            assert title["kind"] == "waiting"
+        assert asked(one, b"1,30,20,20,0\n")["time"] == asked(other, b"30,1,20,20,0\n")["time"] == 1
+        with connected(path) as nameless:
+            assert asked(nameless, b"2,30,20,20,0\n")["kind"] == "error"
+
+
 def test_a_peer_that_does_not_read_holds_up_no_other(tmp_path):
     path = tmp_path / "monitor.sock"
     with served(SocketTransport(path)), connected(path) as deaf, connected(path) as peer:

@@ -92,14 +92,15 @@ class Decider:
             twin.decide(observation + 0.1 * k * (not self.form.scenes), None)
         twin.end(observation=observation)
 
-    def answer(self, line: bytes, *, is_cut: bool = False) -> Answer:
+    def answer(self, line: bytes, csv: CsvRows | None = None, *, is_cut: bool = False) -> Answer:
         """What is answered to a line: a decision, an end, or an error that names the key.
 
         Messages that are sent again, as after a connection was lost, get the answers of before. One
-        of CSV that may be cut off, as it has no line end, is refused.
+        of ``csv`` (what its stream named) that may be cut off, as it has no line end, is refused.
         """
+        csv = csv or self.csv
         try:
-            if (body := self.csv.read(line, is_cut=is_cut)) is None:
+            if (body := csv.read(line, is_cut=is_cut)) is None:
                 return self._of("waiting", alarm=self._alarm, reason=messages.NO_ROW)
             message = self._running(self.form.read(body))
             self._next = self._sent_before(message)
@@ -108,7 +109,7 @@ class Decider:
             if isinstance(message, Row):
                 self._refuse(message)
         except MessageError as error:
-            place = self.csv.place if self.csv.in_csv or error.about == "line" else ""
+            place = csv.place if csv.in_csv or error.about == "line" else ""
             return self.error(error.about, f"{place}{error}", error.time)
         try:
             return self._accept(message)

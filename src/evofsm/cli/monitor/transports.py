@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
+from copy import copy
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ import msgspec
 from evofsm.cli.journal import asked_to_stop
 from evofsm.cli.monitor.decider import Answer, Decider
 from evofsm.cli.monitor.messages import LONGEST
+from evofsm.cli.monitor.slots import CsvRows
 from evofsm.extras import needs
 from evofsm.fsm.naming import visible
 
@@ -52,16 +54,23 @@ class Server:
         self._over, self._ends = threading.Event(), False
         self._failure: Exception | None = None
 
-    def answer(self, lines: Iterable[bytes], *, is_cut: bool = False) -> bytes:
+    def answer(
+        self, lines: Iterable[bytes], csv: CsvRows | None = None, *, is_cut: bool = False
+    ) -> bytes:
         """What is answered to lines, each with an end."""
         with self._turn:
             going_on = takewhile(lambda _: not self._ends, lines)
-            replies = (self.decider.answer(line, is_cut=is_cut) for line in going_on)
+            replies = (self.decider.answer(line, csv, is_cut=is_cut) for line in going_on)
             answers = b"".join(map(self._line, replies))
             self._heard = time.monotonic()
         return answers
 
-    def converse(self, read: Callable[[int], bytes], write: Callable[[bytes], object]) -> None:
+    def converse(
+        self,
+        read: Callable[[int], bytes],
+        write: Callable[[bytes], object],
+        csv: CsvRows | None = None,
+    ) -> None:
         """Answer the lines of a stream to its end; one that is too long is refused.
 
         Each is answered before the next is decided on: of those that were and nobody heard of, as
@@ -73,9 +82,9 @@ class Server:
             *whole, fragment = (fragment + data).split(b"\n")
             fragment = fragment[: LONGEST + 1]  # however long it gets
             for line in whole:
-                write(self.answer([line.removesuffix(b"\r")]))
+                write(self.answer([line.removesuffix(b"\r")], csv))
         if fragment:
-            write(self.answer([fragment.removesuffix(b"\r")], is_cut=True))
+            write(self.answer([fragment.removesuffix(b"\r")], csv, is_cut=True))
 
     def answer_packet(self, data: bytes) -> bytes:
         """What is answered to some lines that came at once."""
@@ -200,7 +209,7 @@ class SocketTransport:
                 peer.sendall(answers)
 
         with suppress(OSError), peer:
-            server.converse(peer.recv, send)
+            server.converse(peer.recv, send, copy(server.decider.csv))  # by names of its own
         del self._peers[peer]
 
 
