@@ -68,7 +68,7 @@ class Journal(Ledger):
             if sync:
                 self.force()
         except OSError as error:
-            hint = "what came before is kept: make room, and run the same command again"
+            hint = "see to that, and run the same command again: it goes on from what is there"
             raise OSError(error.errno, f"{error.strerror}; {hint}", str(self.path)) from error
 
     def begin_anew(self, settings: Record, *records: Record) -> None:

@@ -263,8 +263,11 @@ class Ledger:
             raise
 
     def force(self) -> None:
-        """Force what was written onto the disk."""
+        """Force what was written onto the disk; an OSError where the file was removed."""
         os.fsync(self._file.fileno())
+        status, path = os.fstat(self._file.fileno()), self.path
+        if not (status.st_nlink or (path.exists() and os.path.samestat(status, path.stat()))):
+            raise FileNotFoundError(errno.ENOENT, "the file was removed", str(path))
 
     def close(self) -> None:
         """Let others have the file."""

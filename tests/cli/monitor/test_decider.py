@@ -254,7 +254,10 @@ def test_a_judge_that_raises_is_answered_and_gone_on_after(monkeypatch):
     assert decider.answer(third)["kind"] == "decision"
 
 
-def test_where_the_audit_log_cannot_be_written_the_decisions_go_on(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("is_removed", "logged"), [(False, 40), (True, 30)])
+def test_without_an_audit_log_decisions_go_on_and_are_logged_again_when_they_can_be(
+    tmp_path, monkeypatch, is_removed, logged
+):
     guard = made()
     guard.audit = log = AuditLog(tmp_path / "audit.jsonl")
     decider, plain = Decider(guard), Decider(made())
@@ -263,14 +266,18 @@ def test_where_the_audit_log_cannot_be_written_the_decisions_go_on(tmp_path, mon
         raise OSError(28, "No space left on device")
 
     for k, row in enumerate(rows(60)):
-        if k == 20:
+        if k == 20 and is_removed:
+            log.path.unlink()
+        elif k == 20:
             monkeypatch.setattr("evofsm.guard.audit_log.os.fsync", full)
+        elif k == 40:
+            monkeypatch.undo()
         for message in [line(row), b'{"end": true}'][: 2 if k % 10 == 9 else 1]:
             assert decider.answer(message) == plain.answer(message)
-    assert guard.audit is None
-    monkeypatch.undo()
-    log.close()
-    assert audit(log.path).is_good  # as far as it goes
+    with pytest.raises(OSError, match="the audit log ends with record"):
+        decider.close()
+    found = audit(log.path)
+    assert (found.is_good, found.replayed) == (True, logged)
 
 
 def test_a_reviser_without_risks_alarms_where_it_differs():

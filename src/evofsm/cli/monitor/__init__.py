@@ -210,6 +210,7 @@ def monitor(
                 observe = options.quoted(sentry.variables or VARIABLES)
             slots = Slots(options.reading_of(**{**reader, "observe": observe, "dt": None}), units)
         decider = Decider(sentry, episode=rows, slots=slots)
+        stack.callback(decider.close)
         if slots is not None and reader:
             si = "; in JSON all but its column of the time is in the SI" * ("unit" in reader)
             notice += f"; rows are read as in a log: {options.typed(reader)}{si}"

@@ -7,6 +7,7 @@ import math
 import re
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from itertools import islice
 from typing import Any, TypeVar
 
@@ -28,7 +29,16 @@ from evofsm.driving.naming import VARIABLES
 from evofsm.driving.traffic import COLUMNS, RATES, TrafficRisk, lies_across
 from evofsm.fsm import EvolvingFSM
 from evofsm.fsm.validation import probability
-from evofsm.guard import ActionReviser, BoxActions, Choices, Foresight, Guard, LearntRisk, Mode
+from evofsm.guard import (
+    ActionReviser,
+    AuditLog,
+    BoxActions,
+    Choices,
+    Foresight,
+    Guard,
+    LearntRisk,
+    Mode,
+)
 from evofsm.guard.api import Proposal, Revision
 from evofsm.guard.foresight import DATES
 from evofsm.guard.reviser import is_spoken, make_usable, passed
@@ -70,6 +80,8 @@ class Decider:
         self._alarm = False
         self._recent: deque[tuple[Message, Answer]] = deque(maxlen=_RECENT)
         self._next: int | None = None  # of the recent ones, where they are being sent again
+        self._lost: AuditLog | None = None  # as it could not be written
+        self._unlogged: OSError | None = None  # why decisions are missing in it
         self._said: set[str] = set()  # what is said once, some of it in each episode
         self._across: dict[str, None] = {}  # who moved across the lane when it moved last
         reviser = guard.reviser
@@ -224,6 +236,16 @@ class Decider:
         self._without_lost_audit(lambda: self.guard.end(failed, observation))
         self.rows, self._alarm = 0, False
         self._said -= {"often", "fast"}
+        if (log := self._lost) is not None:
+            with suppress(OSError, ValueError):  # tried again as the next one ends
+                self.guard.audit, self._lost = AuditLog(log.path, sync=log.sync), None
+
+    def close(self) -> None:
+        """Close the audit log; an OSError where decisions are missing in it."""
+        if isinstance(log := self.guard.audit, AuditLog):
+            log.close()
+        if self._unlogged is not None:
+            raise self._unlogged
 
     def _end_unasked(self) -> None:
         """The same where nobody waits for an answer to it; what somebody's judge raises is said."""
@@ -409,10 +431,12 @@ class Decider:
         try:
             return call()
         except OSError as error:
-            if self.guard.audit is None:
+            if not isinstance(log := self.guard.audit, AuditLog):
                 raise
-            _log.error("without an audit log from here on: %s", error)
-            self.guard.audit = None
+            _log.error("without an audit log until an episode ends: %s", error)
+            with suppress(OSError):
+                log.close()
+            self.guard.audit, self._lost, self._unlogged = None, log, error
             return call()
 
     def _is_alarm(self, revision: Revision) -> bool:
