@@ -261,6 +261,19 @@ def test_local_time_of_irregular_rows_runs_on_where_summer_time_changes(evofsm, 
     assert "times of day are told in UTC" in again
 
 
+def test_where_summer_time_ends_rows_that_stand_still_are_none_of_an_hour_before(evofsm):
+    at, zone, rows = datetime(2025, 10, 25, 23, 30, tzinfo=UTC), ZoneInfo("Europe/Berlin"), []
+    for k in range(180):
+        local = (at + timedelta(minutes=k)).astimezone(zone)
+        rows.append(f"{local:%d.%m.%Y %H:%M:%S};20")
+    again = *rows[:80], *rows[10:160], *rows[150:]  # from before it ended, and after
+    Path("still.csv").write_text("\n".join(["Zeit;heat", *again, ""]))
+    begun = "--observe", "heat", "--action", "", "--time", "Zeit", "--interval", 60
+    live = [json.loads(x) for x in evofsm("monitor", "still.csv", *begun).stdout.splitlines()]
+    numbers = [*range(81), *range(11, 161), *range(151, 181)]
+    assert [answer["n"] for answer in live] == numbers
+
+
 def test_failures_right_after_a_hole_are_counted_wherever_others_are(evofsm):
     chance, time, rows = random.Random(1), 0, []
     for run in range(24):

@@ -147,9 +147,14 @@ class Decider:
             return told
         times, hours = [row.clock for row in rows], [row.hours or 0.0 for row in rows]
         *_, before, unsaid = hours_unsaid(np.array([*times, time := told.time]), "")
-        ways = [*{*hours}, hours[-1] + float(unsaid - before)]
+        ways = [*dict.fromkeys(reversed(hours)), hours[-1] + float(unsaid - before)]
         messages = [structs.replace(told, time=time + 3600.0 * h, hours=h) for h in ways]
-        return next((m for m in messages if m in rows), messages[-1])  # sent again, as it was
+        place = len(self._recent) if self._next is None else self._next + 1
+        successor = [m for m, _ in islice(self._recent, place, place + 1)]  # of one sent again
+        step = time + 3600.0 * ways[-1] - rows[-1].time
+        older = [] if 0.0 < step <= HOLE * self.guard.interval else rows
+        copies = (m for rows_then in (successor, older) for m in messages if m in rows_then)
+        return next(copies, messages[-1])  # sent again, as it was
 
     def _sent_before(self, told: Message) -> int | None:
         """Where among the recent messages one is that is sent again; None if it is a new one.
