@@ -77,17 +77,22 @@ def is_too_close(z):
     return bool(z[0] <= 6.0)
 
 
-def test_what_told_the_guard_where_it_fails_is_named_by_its_module(evofsm, tmp_path):
-    path = tmp_path / "log.jsonl"
+def test_what_told_the_guard_where_it_fails_is_named_by_its_module_or_typed(
+    evofsm, refused, tmp_path
+):
+    path, names = tmp_path / "log.jsonl", ("gap", "speed")
     with AuditLog(path) as written:
-        guard = Guard(low=-2.5, high=2.5, interval=0.25, failed=is_too_close, audit=written)
+        system = {"low": -2.5, "high": 2.5, "interval": 0.25, "names": names}
+        guard = Guard(**system, failed=is_too_close, audit=written)
         for step in range(5):
             guard.decide([20.0 - step, 15.0], 1.0)
         guard.end(observation=[15.0, 15.0])
     assert "5 decisions compared with nothing" in evofsm("audit", path).output
-    again = evofsm("audit", path, "--failed", f"{__name__}:is_too_close")
-    assert again.exit_code == 0, again.output
-    assert "5 decisions as recorded" in again.output
+    for text in (f"{__name__}:is_too_close", "gap<=6"):
+        again = evofsm("audit", path, "--failed", text)
+        assert again.exit_code == 0, again.output
+        assert "5 decisions as recorded" in again.output
+    assert "log.jsonl observes gap, speed" in refused("audit", path, "--failed", "Gap<=6")
     other = evofsm("audit", path, "--failed", "builtins:any")
     assert "DIFFERS at record 8" in other.output
     assert "failed: recorded false, replayed true" in other.output

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import re
+from base64 import b64decode
 from collections.abc import Iterator
+from io import BytesIO
+from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from evofsm.cli.options import Json, argument, imported, option
 
@@ -22,7 +26,7 @@ def audit(
     file: Annotated[Path, argument("An audit log.")],
     head: Annotated[str | None, option("NUMBER:HASH of a record, kept elsewhere.")] = None,
     failed: Annotated[
-        str | None, option("MODULE:FUNCTION, if the guard was given it as failed=.")
+        str | None, option("MODULE:FUNCTION, or a condition, that the guard was given.")
     ] = None,
     as_json: Json = False,
 ) -> int:
@@ -40,7 +44,7 @@ def audit(
     report = examine(
         file,
         None if head is None else Head.parse(head),
-        failed=None if failed is None else imported(failed),
+        failed=None if failed is None else _failure(file, failed),
     )
     if as_json:
         document = {**report._asdict(), "head": str(report.head), "is_good": report.is_good}
@@ -50,6 +54,22 @@ def audit(
         if report.is_good and head is None:
             show(f"\n{_KEEP}")
     return 0 if report.is_good else 1
+
+
+def _failure(file: Path, text: str) -> Any:
+    """What a name stands for, or a condition of what the guard that the log began with observes."""
+    from evofsm.cli.models import failure, load_guard
+    from evofsm.guard.audit_log import Chain
+
+    if re.fullmatch(r"[\w.]+:[\w.]+", text):
+        return imported(text)
+    guards = [record.content.get("guard") for record in islice(Chain(file).records(), 1)]
+    place = BytesIO(b64decode(next(filter(None, guards), "")))
+    names = load_guard(place).variables if place.getvalue() else ()
+    if (condition := failure(text, names)) is None:
+        fault = f"the guard in {file} observes {', '.join(names) or 'what has no names'}"
+        raise ValueError(f"--failed {text} is of other columns: {fault}")
+    return condition
 
 
 def _facts(found: Audit) -> Iterator[tuple[str, str]]:

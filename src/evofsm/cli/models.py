@@ -29,7 +29,7 @@ _STATES_LISTED, _PASSAGES = 20, 12
 _ROWS_SHOWN = 20_000  # of a longer log so many rows are drawn
 
 
-def load_guard(path: Path) -> Guard:
+def load_guard(path: store.Place) -> Guard:
     """A guard that learns no more: a function of failures that it knew is not asked."""
     guard = Guard.load(path, failed=lambda seen: False)
     if isinstance(guard.judge, LearntRisk):

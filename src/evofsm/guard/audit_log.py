@@ -582,7 +582,7 @@ def _plain(kind: type, value: Any) -> Any:
 _NONSENSE = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError)
 _NO_FUNCTION = (
     "the guard was given a function that says where it fails, and no log holds code; give it as "
-    "failed (--failed MODULE:FUNCTION)"
+    "failed (--failed MODULE:FUNCTION, or the condition as the monitor was given it)"
 )
 # What is said of records that come out otherwise, but of decisions.
 _OTHERWISE = dict.fromkeys(("start", "settings"), "there are no such settings")
