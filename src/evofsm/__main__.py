@@ -1,5 +1,6 @@
 """The command ``evofsm``, also as ``python -m evofsm``."""
 
+import os
 import sys
 
 from evofsm.extras import refuse_without_command_line
@@ -7,6 +8,8 @@ from evofsm.extras import refuse_without_command_line
 
 def main() -> None:
     """Run the command line."""
+    if sys.stderr is None:  # closed: notices are no answers
+        sys.stderr = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
     try:
         refuse_without_command_line()
         from evofsm.cli.app import application, run

@@ -310,6 +310,8 @@ def test_streams_that_are_closed_or_do_not_wait_end_it_in_a_line_or_not_at_all()
         done = subprocess.run(f"{base} {closed}", shell=True, capture_output=True, text=True)
         assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
         assert f"standard {name} is closed" in done.stderr
+    done = subprocess.run(f"{base} 2>&-", shell=True, capture_output=True, input=ROWS[0])
+    assert (done.returncode, done.stdout.count(b"\n"), done.stdout[:1]) == (0, 1, b"{")
     (source, feed), (drain, sink) = os.pipe(), os.pipe()
     with started(stdin=source, stdout=sink) as process:
         os.write(feed, ROWS[0] + b"\n")
