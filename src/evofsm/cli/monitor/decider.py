@@ -29,17 +29,9 @@ from evofsm.driving.naming import VARIABLES
 from evofsm.driving.traffic import COLUMNS, RATES, TrafficRisk, lies_across
 from evofsm.fsm import EvolvingFSM
 from evofsm.fsm.validation import probability
-from evofsm.guard import (
-    ActionReviser,
-    AuditLog,
-    BoxActions,
-    Choices,
-    Foresight,
-    Guard,
-    LearntRisk,
-    Mode,
-)
+from evofsm.guard import ActionReviser, BoxActions, Choices, Foresight, Guard, LearntRisk, Mode
 from evofsm.guard.api import Proposal, Revision
+from evofsm.guard.audit_log import AuditLog
 from evofsm.guard.foresight import DATES
 from evofsm.guard.reviser import is_spoken, make_usable, passed
 from evofsm.io.logs import hours_unsaid

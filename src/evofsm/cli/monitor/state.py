@@ -93,6 +93,7 @@ class State:
                 hear(decider.act(msgspec.convert(record["told"], Taken)))
             except Exception as error:  # of another version: no reason not to begin
                 _log.error("%s: a message is left out: %s", self._journal.path, error)
+        self._journal.records.clear()  # of days they are large
         return self._count
 
     def pass_over(self, file: Path, decider: Decider) -> int:
