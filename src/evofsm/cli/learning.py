@@ -397,7 +397,7 @@ def told_of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float)
         judges = "evofsm monitor LOG --summary, with the same options, judges such alarms held out"
         yield f"{judges}; evofsm inspect {path} prints its states."
     elif isinstance(judge, LearntRisk):
-        note = "" if len(judge.state.forms) else " nothing yet"
+        note = "" if judge.state.knows_failure else " nothing yet"
         yield f"It judges{note}: {judge.told_by_experience}."
         if beyond:
             yield f"It knows no action beyond --action-range, where {beyond:.1%} of the log's are."

@@ -236,7 +236,7 @@ def _common(guard: Guard, reviser: ActionReviser, m: int) -> tuple[dict[str, Any
 def _learnt(reviser: ActionReviser) -> Part:
     risk: Any = reviser.risk
     state, parts = risk.state, risk.parts
-    if parts is None or not len(state.forms):
+    if parts is None or not state.knows_failure:
         raise ValueError(f"there is nothing to export yet: {risk.told_by_experience}")
     model, rest = parts.model, parts.residuals  # frozen, it doubts nothing
     (steps, rows, count), (p, m), a = rest.shape, model.weights.shape, risk.size

@@ -57,6 +57,16 @@ def test_a_single_failure_amid_what_was_survived_says_nothing_of_where_it_fails(
     assert inside(explain(FAILS, again, known), again).any(0).all()
 
 
+def test_of_failures_by_chance_a_form_of_one_says_nothing():
+    """Without it a single failure at the rim of what was seen is explained."""
+    random = np.random.default_rng(1)
+    seen, rim = random.uniform(-1.0, 1.0, (2000, 2)), np.array([[0.97, 0.97]])
+    known = survived_as(seen[(seen < 0.9).any(1)], np.full(2, 0.1))
+    assert len(explain(FAILS, rim, known)) == 1
+    by_chance = np.vstack([rim, random.uniform(-0.8, 0.8, (10, 2))])
+    assert (explain(FAILS, by_chance, known)[:, HELD] > 1).all()
+
+
 @pytest.mark.parametrize("shape", SHAPES)
 def test_forms_explain_failures_and_nothing_that_was_survived_is_inside(shape):
     seen = np.random.default_rng(0).uniform(-2.0, 2.0, (2000, 3))

@@ -116,6 +116,28 @@ def test_nothing_is_revised_before_the_first_failure_and_it_says_why(point):
     assert all(math.isnan(one.risk_proposed) for one in said)
 
 
+def test_where_only_good_endings_are_known_nothing_is_judged_and_all_are_counted():
+    guard = Guard(-1.0, 1.0, interval=0.1)
+    for start in range(5):
+        for k in range(20):
+            guard.decide([20.0 + start - k], 0.0)
+        guard.end(observation=[0.0], terminated=True)
+    said = guard.decide([1.0], 1.0)
+    assert math.isnan(said.risk_proposed)
+    assert "no failure is known yet" in said.reason
+    assert "(5 endings)" in str(guard)
+
+
+def test_what_failed_where_something_was_survived_is_said_to_fail_there():
+    guard = Guard(n_actions=2, interval=1.0)
+    for episode in range(12):
+        path = [0, 1, 2, 3, 2, 1, 0] if episode == 5 else [0, 1, 2, 1, 2]
+        for z in path:
+            guard.decide([z, episode % 2], episode % 2)
+        guard.end(observation=[3 * (episode % 2), episode % 2], failed=episode % 2 > 0)
+    assert "fails where variable 1 is at or above 3" in str(guard)
+
+
 def test_told_what_failure_is_it_keeps_from_the_first_one(point):
     guard = point.guard(failed=lambda z: z[0] >= 1.0, shadow=False)
     assert sum(point.play(guard, k)[1] for k in range(6)) <= 1
@@ -421,5 +443,6 @@ def test_where_there_is_but_one_action_reasons_name_no_backup():
         said += [guard.decide([one, rises], 0).reason for one in z[:-1]]
         guard.end(failed=bool(z[-1] > 8.0), observation=[z[-1], rises])
     refused = [reason for reason in said if reason.endswith("; nobody acts")]
-    assert any(reason.startswith("it fails, even if nothing disturbs it") for reason in refused)
+    record = "it fails, even if nothing disturbs it; so it seemed in 1 episode of late: 1 failed;"
+    assert any(reason.startswith(record) for reason in refused)
     assert not any("no backup" in reason for reason in said)

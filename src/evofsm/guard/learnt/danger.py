@@ -126,7 +126,8 @@ def _endings(state: State, table: Floats, known: Survived) -> Floats:
     rows, endings = failure.without(failure.saying(table, ENDS), known.rows), state.ended
     if len(known.rows) and (~failure.inside(rows, endings).any(0)).mean() > _STRAY:
         rows = failure.explain(ENDS, endings, failure.boxed(known, known.rows))
-    rows = rows[failure.inside(rows, endings).sum(1) >= _ENDED]
+    rows = rows[(number := failure.inside(rows, endings).sum(1)) >= _ENDED].copy()
+    rows[:, HELD] = number[number >= _ENDED]
     # What fails as others do elsewhere does not fail for how it ends.
     at_end = failure.inside(rows, state.failures).any(0)
     by = failure.inside(failure.saying(table, FAILS), state.failures)

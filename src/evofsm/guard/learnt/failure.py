@@ -302,7 +302,10 @@ def explain(says: int, failures: Floats, survived: Survived) -> Floats:
             bent, strong = alone, np.zeros(len(strong), bool)
     within: Flags = np.asarray(inside(bent, failures).any(0))
     keep = [bool(s or not within[holds].all()) for s, holds in zip(strong, by, strict=True)]
-    return counted(np.concatenate([stay[keep], bent]), failures, survived)
+    table = counted(np.concatenate([stay[keep], bent]), failures, survived)
+    if says == FAILS and 2 * inside(table, failures).any(0).sum() < k:  # most are by chance
+        return table[table[:, HELD] > 1]
+    return table
 
 
 def sides_of(says: int, failures: Floats, survived: Survived) -> Floats:

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from evofsm import store
 from evofsm.fsm.kernels import COMPILES, announce_compiling
 from evofsm.fsm.naming import Labels
-from evofsm.fsm.proportions import poisson_bounds
+from evofsm.fsm.proportions import binomial_bounds, poisson_bounds
 from evofsm.fsm.sharing import Rollback
 from evofsm.fsm.validation import action_name, function, positive, whole
 from evofsm.guard.actions import ActionSet, BoxActions, Choices, Mask, limits
@@ -251,7 +251,8 @@ class LearntRisk(ObservingJudge, SearchingJudge):
     @property
     def remembered(self) -> Remembered:
         """Disturbances that it counts on, and the time in which they were seen."""
-        return Remembered(len(self.state.windows), self.state.n_seen * self.state.stride * self.dt)
+        seconds, ends = self.state.n_seen * self.state.stride * self.dt, self.state.lost
+        return Remembered(len(self.state.windows), seconds, lost=(int(ends.sum()), len(ends)))
 
     def search(
         self,
@@ -270,7 +271,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         if not self.n_variables:
             rollout.refuse_too_many(len(situation.observation), self.size, box=not self.choices)
         here, options, parts = self._here(situation.observation), np.array([wanted]), self.parts
-        if parts is None or here is None or not len(self.state.forms):
+        if parts is None or here is None or not self.state.knows_failure:
             self._certified = False
             why = words.NOTHING_SEEN if parts and here is None else self._no_threshold
             why = why if parts or self.state.n_failed else words.NOTHING_LEARNT
@@ -330,7 +331,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
     def judge(self, situation: Situation, actions: ArrayLike) -> Judgement:
         """Risk of each action, (k,) or (k, d); NaN as long as nothing can be said."""
         options, here = np.asarray(actions, np.float64), self._here(situation.observation)
-        if here is None or self.parts is None or not len(self.state.forms):
+        if here is None or self.parts is None or not self.state.knows_failure:
             return _unjudged(len(options))
         policies = self.state.policies
         outcomes = [self._foresee(here, self.encode(action), policies) for action in options]
@@ -378,11 +379,13 @@ class LearntRisk(ObservingJudge, SearchingJudge):
     def _risk(self, unsurvived: float, soon: float) -> tuple[float, float, float]:
         """Probability, with its 90 % interval, that within the horizon something begins of those.
 
-        Certain where nothing helps by the model, of which nobody knows how good it is. Where all
-        that it may remember are not survived, it is not known how many more were forgotten.
+        Where nothing helps by the model it is the share of episodes that then failed; certain, as
+        far as anybody knows, before there was any. Where all that it may remember are not survived,
+        it is not known how many more were forgotten.
         """
         if math.isinf(unsurvived):
-            return 1.0, 0.0, 1.0
+            n_failed, n = self.remembered.lost
+            return (n_failed / n, *binomial_bounds(n_failed, n)) if n else (1.0, 0.0, 1.0)
         low, high = poisson_bounds(int(unsurvived))
         high = high if unsurvived < self.settings.n_disturbances else math.inf
         return -math.expm1(-unsurvived * soon), -math.expm1(-low * soon), -math.expm1(-high * soon)

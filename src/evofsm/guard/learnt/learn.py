@@ -73,11 +73,12 @@ def learn(state: State, episode: Episode, given: Given) -> State:
     if given.failed is None:
         was_tried = failure.inside(failure.saying(before.forms, FAILS), safe, 0.0).any()
         state = doubted(state, episode, tried=bool(was_tried))
+    state = lost(state, episode)
     refutations = 1 + np.flatnonzero(episode.lost[1 : max(1, len(safe) - state.horizon)])
     if len(refutations):
         state = motion.misled(state, safe, u, refutations, failed=episode.failed)
     # Disturbances
-    motion_model, looks, fails = model_of(state), looks_for_harm(state), len(state.forms)
+    motion_model, looks, fails = model_of(state), looks_for_harm(state), state.knows_failure
     state = state._replace(n_scanned=state.n_scanned + looks)
     state = disturbances(state, motion_model, safe, u, random)
     rest = residuals_of(state, motion_model, state.horizon)
@@ -96,6 +97,19 @@ def learn(state: State, episode: Episode, given: Given) -> State:
         sample = np.ascontiguousarray(rest[:, :, numbers])
         state = evolved(state, motion_model, sample, random)
     return state._replace(n_episodes=state.n_episodes + 1)
+
+
+def lost(state: State, episode: Episode) -> State:
+    """Note how an episode ended in which nothing seemed to help.
+
+    It failed within the horizon, or ended by itself, or went on for as long; of others it is not
+    known.
+    """
+    soon, long_ago = episode.lost[-state.horizon :].any(), episode.lost[: -state.horizon].any()
+    if not (long_ago or (soon and (episode.failed or episode.terminated))):
+        return state
+    outcomes = np.append(state.lost, float(episode.failed and soon))
+    return state._replace(lost=outcomes[-state.settings.settled :])
 
 
 def doubted(state: State, episode: Episode, *, tried: bool) -> State:
@@ -144,7 +158,7 @@ def noted(state: State, z: Floats, episode: Episode, random: Generator) -> State
 
 def looks_for_harm(state: State) -> bool:
     """Whether it is known where it fails, and enough situations to find what harms there."""
-    return len(state.forms) > 0 and len(state.situations) > _ENOUGH
+    return state.knows_failure and len(state.situations) > _ENOUGH
 
 
 def disturbances(state: State, known: Model, z: Floats, u: Floats, random: Generator) -> State:
@@ -251,13 +265,14 @@ def look_ahead(state: State, known: Model, rest: Floats, episode: Episode) -> St
 
     Farther after an episode that failed as late after its last certificate as where nothing helps:
     what fails sooner was not foreseen for another reason. Less far after one that went on for the
-    whole horizon from where nothing seemed to help, but not as far as was too short lately. What
-    the model says of failure farther away than that is believed again little by little.
+    whole horizon from where nothing seemed to help, or ended by itself, but not as far as was too
+    short lately. What the model says of failure farther away than that is believed again little by
+    little.
     """
     H, s, most = state.horizon, state.settings, farthest(known, state.settings)
     ends = value_of(known, state.situations, state.policies[: s.n_asked], rest)
     after = float(ends[ends < 0.0].max(initial=-1.0 - H) + 1 + H)
-    is_refuted = len(episode.lost) > H and episode.lost[:-H].any()
+    is_refuted = (episode.lost if episode.terminated else episode.lost[:-H]).any()
     T, trust = state.time_to_failure, state.believed
     too_short = s.latest * state.too_short
     if is_refuted and not episode.failed:  # it sees less far than it looks

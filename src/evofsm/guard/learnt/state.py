@@ -11,7 +11,7 @@ import numpy as np
 from evofsm.guard.harm import OUTCOMES, SETTINGS
 from evofsm.guard.learnt import failure, model, rollout
 from evofsm.guard.learnt.failure import HELD, ONE, OTHER, SAYS, B, I, J, Survived
-from evofsm.guard.learnt.rollout import CRASHES, FAILS, FATAL, Floats, Model
+from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS, FATAL, Floats, Model
 from evofsm.store import COUNT, FROM_1, SHARE, SIZE, SMALLEST, Kind, Numbers
 
 #: From an observation and an encoded action (a,) to the observation a decision later.
@@ -164,6 +164,8 @@ class State(NamedTuple):
     radii: Annotated[Floats, _ABOVE_0.of("dead_ends")]
     counts: Annotated[Floats, _ABOVE_0.of("dead_ends")]
     fatal: Annotated[Floats, _SEEN.of("fatal", "m")]  #: where what nothing survives began
+    #: of the latest episodes in which nothing seemed to help, 1 of those that then failed
+    lost: Annotated[Floats, SHARE.of("lost")]
     # disturbances
     windows: Annotated[Floats, _SEEN.of("windows", "steps", "seen")]  #: observations and actions
     spans: Annotated[Floats, COUNT.of("windows", 2)]  #: steps of each, and its episode
@@ -205,6 +207,11 @@ class State(NamedTuple):
             horizon=settings.horizon if horizon is None else horizon,
             stride=1,
         )
+
+    @property
+    def knows_failure(self) -> bool:
+        """Whether anything is known to fail: not only where episodes end by themselves."""
+        return len(self.centres) > 0 or bool((self.forms[:, SAYS] != ENDS).any())
 
     @property
     def is_doubted(self) -> bool:

@@ -66,6 +66,8 @@ class Remembered(NamedTuple):
     number: int
     seconds: float  #: of observation that they come from
     spared: int = 0  #: so many of them need not be survived
+    #: episodes that failed, of the latest in which nothing seemed to help
+    lost: tuple[int, int] = (0, 0)
 
     def __str__(self) -> str:
         time = f"{self.seconds:,.0f} s" if self.seconds >= 10.0 else f"{self.seconds:.1f} s"
@@ -91,7 +93,10 @@ def kept(backup: str, remembered: Remembered, left: float) -> str:
 def refused(unsurvived: int, remembered: Remembered, margin: float, scale: float) -> str:
     """Why an action is dangerous; ``unsurvived`` is -1 without a disturbance, 0 by the margin."""
     if unsurvived < 0:
-        return "no backup prevents failure, even if nothing disturbs it"
+        n_failed, n = remembered.lost
+        text = "no backup prevents failure, even if nothing disturbs it"
+        text += f"; so it seemed in {counted(n, 'episode')} of late: {n_failed} failed" * (n > 0)
+        return text
     if unsurvived == 0:
         text = f"no backup survives {remembered.most} by the margin of {changes(margin)}"
         return text if scale < _HARDER else f"{text}, were they {scale:.2g} times as hard"
@@ -194,7 +199,9 @@ def _where(table: Floats, names: Sequence[str]) -> tuple[str, list[str], list[st
     for row, is_side in zip(table, failure.are_sides(table), strict=True):
         text = region(names, row[I:HELD].tolist(), int(row[HELD]), _WHAT[int(row[SAYS])])
         if is_side and row[SAYS] == FAILS:
-            sides.append(text.removeprefix("where ").partition(" (")[0])
+            name, _, beyond = text.removeprefix("where ").partition(" (")[0].rpartition(" is ")
+            at = "at or " * (not row[HELD])  # what failed was at the end of what was survived
+            sides.append(f"{name} is {at}{beyond}")
         else:
             places[int(row[SAYS])].append(text)
     there = [" or ".join([f"where {' or '.join(sides)}"] * bool(sides) + places[FAILS])]
