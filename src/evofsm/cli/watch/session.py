@@ -590,6 +590,7 @@ class Session(AbstractContextManager["Session"]):
         revision = guard.decide(self.system.observation, self.system.propose(), frame.time)
         situation, judgement = guard.situation, self._judged
         self.system.advance(revision)
+        executed = put_into(guard.actions, revision.executed)  # what passes may lie outside
         rows = zip(judgement.risk, judgement.low, judgement.high, judgement.critical, strict=True)
         wish, act, best = (shown.Judged(*map(float, values)) for values in rows)
         return frame._replace(
@@ -600,7 +601,7 @@ class Session(AbstractContextManager["Session"]):
             proposed=shown.numbers(revision.proposed),
             executed=shown.numbers(revision.executed),
             advised=shown.numbers(revision.advised),
-            revised=change(guard.actions, self._wanted, revision.executed) > _SAME_ACTION,
+            revised=change(guard.actions, self._wanted, executed) > _SAME_ACTION,
             advises=change(guard.actions, self._wanted, revision.advised) > _SAME_ACTION,
             reason=revision.reason,
             explanation=revision.explanation,
