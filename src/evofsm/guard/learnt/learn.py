@@ -265,14 +265,13 @@ def look_ahead(state: State, known: Model, rest: Floats, episode: Episode) -> St
 
     Farther after an episode that failed as late after its last certificate as where nothing helps:
     what fails sooner was not foreseen for another reason. Less far after one that went on for the
-    whole horizon from where nothing seemed to help, or ended by itself, but not as far as was too
-    short lately. What the model says of failure farther away than that is believed again little by
-    little.
+    whole horizon from where nothing seemed to help, but not as far as was too short lately. What
+    the model says of failure farther away than that is believed again little by little.
     """
     H, s, most = state.horizon, state.settings, farthest(known, state.settings)
     ends = value_of(known, state.situations, state.policies[: s.n_asked], rest)
     after = float(ends[ends < 0.0].max(initial=-1.0 - H) + 1 + H)
-    is_refuted = (episode.lost if episode.terminated else episode.lost[:-H]).any()
+    is_refuted = len(episode.lost) > H and episode.lost[:-H].any()
     T, trust = state.time_to_failure, state.believed
     too_short = s.latest * state.too_short
     if is_refuted and not episode.failed:  # it sees less far than it looks
