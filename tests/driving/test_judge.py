@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from evofsm import driving
 from evofsm.driving import IDM, Leader, Scenario, guard_for_cars
 from evofsm.driving.judge import LatentRisk, dead_ends_of
-from evofsm.driving.leaders import REAL_DRIVES
 from evofsm.driving.rehearsal import HARDEST, critical_decelerations
 from evofsm.driving.rehearsal import Body as Follower
 from evofsm.fsm.machine import EvolvingFSM
@@ -333,19 +332,3 @@ def test_states_are_judged_at_their_centres():
     brink = EvolvingFSM(n_actions=1)
     brink.observe([7.0, 10.0, 10.0])  # full braking saves, keeping the speed does not
     assert dead_ends_of(brink, risk) == []
-
-
-# -- Sharing, and a table to begin with -------------------------------------------------------
-
-
-def test_with_a_table_of_real_drives_a_tolerance_can_be_met_at_once():
-    cautious, begun = (
-        LatentRisk(-8.0, decel=7.0, leader_decel=10.0, leaders=leaders)
-        for leaders in (None, REAL_DRIVES)
-    )
-    here = situation(10.0, 20.0, 20.0)  # survived only up to some 9 m/s² of the leader
-    assert cautious.judge(here, [0.0]).risk[0] == 1.0
-    judged = begun.judge(here, [0.0])
-    assert 0.0 < judged.risk[0] <= 0.02
-    assert judged.high[0] > 0.02  # it is not sure
-    assert judged.evidence == sum(REAL_DRIVES.counts)
