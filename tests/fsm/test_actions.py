@@ -70,22 +70,6 @@ def test_an_interval_that_does_not_exist_is_refused(i):
             method(i)
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"low": math.nan}, "low is nan"),
-        ({"high": math.inf}, "high is inf"),
-        ({"width": 0.0}, "width is 0.0"),
-        ({"low": 2.5}, "low must be below high"),
-        ({"outside": "ignore"}, "outside is 'ignore'"),
-        ({"low": 0.0, "high": 1e-10, "width": 1e-11}, "larger unit"),
-    ],
-)
-def test_settings_that_make_no_sense_are_refused(change, words):
-    with pytest.raises(ValueError, match=words):
-        IntervalActions(**{**PAPER, **change})
-
-
 def test_labels_show_which_edges_belong_to_the_interval():
     for outside, ends in (("error", ("[-2.5, -2.2)", "[2.3, 2.5]")), ("clip", ("< -2.2", "≥ 2.3"))):
         actions = IntervalActions(**PAPER, outside=outside)
@@ -131,6 +115,12 @@ def test_a_value_that_is_no_number_is_named(value):
 @pytest.mark.parametrize(
     ("make", "words"),
     [
+        (lambda: IntervalActions(math.nan, 2.5, 0.3), "low is nan"),
+        (lambda: IntervalActions(-2.5, math.inf, 0.3), "high is inf"),
+        (lambda: IntervalActions(-2.5, 2.5, 0.0), "width is 0.0"),
+        (lambda: IntervalActions(2.5, 2.5, 0.3), "low must be below high"),
+        (lambda: IntervalActions(**PAPER, outside="ignore"), "outside is 'ignore'"),
+        (lambda: IntervalActions(0.0, 1e-10, 1e-11), "larger unit"),
         (lambda: Category("light", ("red",)), "light: needs two or more"),
         (lambda: Category("light", ("red", "red", "green")), "different values"),
         (lambda: Category("light", ("red", "green"), distance=0.0), "distance is 0.0"),
@@ -139,6 +129,6 @@ def test_a_value_that_is_no_number_is_named(value):
         (lambda: ObservationEncoder("gap", "gap"), "same name twice"),
     ],
 )
-def test_variables_that_make_no_sense_are_refused(make, words):
+def test_actions_and_variables_that_make_no_sense_are_refused(make, words):
     with pytest.raises(ValueError, match=words):
         make()

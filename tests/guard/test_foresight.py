@@ -203,16 +203,11 @@ def test_what_counts_as_foreseen_and_as_false(heat, failed, hold, told):
     assert (found.foreseen, found.lead, found.false) == (foreseen, minutes * DT, false)
 
 
-def test_an_episode_of_which_nothing_was_seen_ends_and_teaches_nothing():
+def test_an_end_teaches_what_was_seen_and_once_if_the_audit_log_refused_it(tmp_path, full_at):
     judge = Foresight.from_zero(dt=DT, names=NAMES)
     guard = Guard.of(ActionReviser(judge, Choices(1)), interval=DT, judge=judge)
     guard.end()
     assert not len(judge.log.starts)
-
-
-def test_an_end_that_the_audit_log_refuses_is_learnt_once_when_it_is_made_again(tmp_path, full_at):
-    judge = Foresight.from_zero(dt=DT, names=NAMES)
-    guard = Guard.of(ActionReviser(judge, Choices(1)), interval=DT, judge=judge)
     for k in range(4):
         with AuditLog(tmp_path / "log") as guard.audit:
             for heat in range(20):

@@ -231,11 +231,8 @@ def test_time_is_counted_where_it_is_not_told():
 def test_proposals_that_are_all_outside_the_range_are_told_of_once():
     guard = Guard(low=0.0, high=1.0, interval=1.0)
     for k in range(300):  # in percent
-        with (
-            pytest.warns(UserWarning, match=r"is outside \[0, 1\] by far, as 100")
-            if k == 99
-            else nullcontext()
-        ):
+        told = pytest.warns(UserWarning, match=r"is outside \[0, 1\] by far, as 100")
+        with told if k == 99 else nullcontext():
             guard.decide([0.1 * k], 50.0 + k % 50)
 
 
