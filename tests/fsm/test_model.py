@@ -142,12 +142,9 @@ def test_a_forecast_that_makes_no_sense_is_refused(arguments, words):
         chain(SWITCH, STAY).propagate(**{"belief": [1.0, 0.0], "action": 0, **arguments})
 
 
-def test_models_and_steps_are_shown_in_a_line():
+def test_steps_are_shown_in_a_line():
     machine = EvolvingFSM(n_actions=2, rule=Novelty(radius=0.001))
     machine.learn_many(np.arange(500.0)[:, None], np.zeros(500, int))
-    model = machine.model(names=["gap"])
-    said = f"FSMModel(500 states of gap, 2 actions, 500 observations, {machine.rule!r})"
-    assert str(model) == repr(model) == said
     machine.start_episode()
     step = machine.observe([3.2])
     assert repr(step) == "Step(state=500, belief=1 of 501 states, event=CREATED, surprise=nan)"
