@@ -72,20 +72,18 @@ def test_a_face_offers_each_name_once_in_order_and_no_module_hides_it(face):
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
 
 
-@pytest.mark.parametrize(
-    "told",
-    [
-        ("CITATION.cff", r"^version: (.+)$"),
-        ("recipe/recipe.yaml", r'^  version: "(.+)"$'),
-        ("src/evofsm/__init__.py", r'^__version__ = "(.+)"$'),
-    ],
-    ids=lambda told: told[0],
-)
-def test_the_version_is_told_alike(told):
-    file, pattern = told
+TOLD = {
+    "CITATION.cff": r"^version: (.+)$",
+    "recipe/recipe.yaml": r'^  version: "(.+)"$',
+    "src/evofsm/__init__.py": r'^__version__ = "(.+)"$',
+}
+
+
+@pytest.mark.parametrize("file", TOLD)
+def test_the_version_is_told_alike(file):
     if not (ROOT / file).exists():
         pytest.skip("no part of the sdist")
-    assert re.findall(pattern, (ROOT / file).read_text("utf-8"), re.M) == [PROJECT["version"]]
+    assert re.findall(TOLD[file], (ROOT / file).read_text("utf-8"), re.M) == [PROJECT["version"]]
 
 
 def test_the_recipe_asks_for_what_the_wheel_asks_for():

@@ -59,10 +59,6 @@ def whole():
     return file.getvalue()
 
 
-def read(data):
-    return store.read(io.BytesIO(data), DRAWS)
-
-
 # -- What is written is read ---------------------------------------------------------------------
 
 
@@ -130,7 +126,7 @@ def test_a_file_with_one_bit_flipped_anywhere_is_refused(whole):
         damaged = bytearray(whole)
         damaged[place] ^= 1 << place % 8
         with pytest.raises(ValueError, match="what was given"):
-            read(damaged)
+            store.read(io.BytesIO(damaged), DRAWS)
 
 
 @pytest.mark.parametrize(

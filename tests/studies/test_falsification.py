@@ -14,11 +14,7 @@ from evofsm.paper import write_page
 
 def above(least):
     """Fails with a probability of 1 - least."""
-
-    def score(chance):
-        return math.inf if chance("x") >= least else chance("x")
-
-    return score
+    return lambda chance: math.inf if chance("x") >= least else chance("x")
 
 
 def test_splitting_and_plain_sampling_say_the_same_where_both_see():

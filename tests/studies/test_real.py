@@ -54,11 +54,6 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def cases(folder):
-    return [case_of(one) for one in read_runs(runs_in(folder))]
-
-
-@pytest.fixture(scope="module")
 def rows(folder):
     return Real(data=folder, folds=2, rounds=20).run(workers=1)["rows"]
 
@@ -124,10 +119,10 @@ def test_what_is_under_way_or_not_known_is_no_case():
 # -- What is learnt, and how it is judged ---------------------------------------------------------
 
 
-def test_every_question_is_put_to_every_measure_and_rows_hold_what_they_say(rows, cases):
+def test_every_question_is_put_to_every_measure_and_rows_hold_what_they_say(rows, folder):
     assert len(rows) == len(TARGETS) * len(HORIZONS) * rows["measure"].n_unique()
     row = rows.row(by_predicate=(pl.col("measure") == "ttc") & _asks(TTC_3), named=True)
-    known = [case.answers[TTC_3].known for case in cases]
+    known = [case_of(one).answers[TTC_3].known for one in read_runs(runs_in(folder))]
     assert row["decisions"] == sum(k.sum() for k in known)
     assert (row["runs"], row["over_ttc"]) == (4, 0.0)
     assert row["auroc_low"] <= row["auroc"] <= row["auroc_high"]

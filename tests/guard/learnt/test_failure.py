@@ -97,13 +97,6 @@ AMID = [[-0.1, 13.0], [0.1, 4.0], [0.2, 5.0], [0.3, 6.0]]
 ABOVE_ALONE = np.array([[0.0, 0.2], [0.2, 0.2]])  # who stands, does not fail for it
 
 
-def sides(failures, rows, unit, blur):
-    """Variables, directions and places of sides."""
-    found = sides_of(FAILS, failures, survived_as(rows, unit)._replace(noise=blur))
-    assert (found[:, C] == 0.0).all()
-    return {(int(i), sign, at) for i, sign, at in found[:, [I, B, AT]].tolist()}
-
-
 @pytest.mark.parametrize(
     ("failures", "blur", "ends"),
     [
@@ -121,8 +114,10 @@ def sides(failures, rows, unit, blur):
     ],
 )
 def test_failures_are_explained_by_ends_of_what_was_survived(failures, blur, ends):
-    rows = np.linspace([0.0, 0.0], [10.0, 10.0], 40)
-    assert sides(np.array(failures), rows, np.ones(2), blur) == ends
+    known = survived_as(np.linspace([0.0, 0.0], [10.0, 10.0], 40), np.ones(2))
+    found = sides_of(FAILS, np.array(failures), known._replace(noise=blur))
+    assert (found[:, C] == 0.0).all()
+    assert {(int(i), sign, at) for i, sign, at in found[:, [I, B, AT]].tolist()} == ends
 
 
 def test_of_flags_those_failures_count_in_which_they_were_set():
@@ -151,16 +146,10 @@ def play(guard, episode):
     return said, failed
 
 
-@pytest.fixture(scope="module")
-def taught():
-    """A guard that learnt where the disc is."""
-    guard = Guard(-np.ones(2), np.ones(2), interval=0.1, horizon=2.0)
+def test_a_disc_is_learnt_said_and_no_threshold(snapshot, reloaded):
+    taught = Guard(-np.ones(2), np.ones(2), interval=0.1, horizon=2.0)
     for episode in range(12):
-        play(guard, episode)
-    return guard
-
-
-def test_a_disc_is_learnt_said_and_no_threshold(taught, snapshot, reloaded):
+        play(taught, episode)
     state = taught.judge.state
     assert (state.forms[:, SAYS] == FAILS).any()
     survived = np.concatenate([state.survived, state.brinks])
