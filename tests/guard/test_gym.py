@@ -132,17 +132,13 @@ def above_half(action):
 # -- One environment ---------------------------------------------------------------------------
 
 
-def test_it_decides_and_learns_bit_for_bit_as_a_loop_of_ones_own(snapshot):
-    env, plain = of_cars(CarFollowing()), CarFollowing()
-    guard = guard_for_cars(-2.5, 2.5)
+def test_it_decides_and_learns_bit_for_bit_as_a_loop_does(snapshot):
+    env, guard = of_cars(CarFollowing()), guard_for_cars(-2.5, 2.5)
     for index in range(3):
-        revised = drive(env, lambda *_: np.array([2.5]), options={"index": index})
-        (seen, _), over, executed = plain.reset(options={"index": index}), False, []
-        while not over:
-            executed.append(guard.decide(seen, 2.5).executed)
-            seen, _, terminated, truncated, info = plain.step(np.array([executed[-1]]))
-            over = terminated or truncated
-        guard.end(info["failed"], seen)
+        how = {"options": {"index": index}}
+        revised = drive(env, lambda *_: np.array([2.5]), **how)
+        loop = run_episode(CarFollowing(), guard, lambda seen: 2.5, **how)
+        executed = [one.revision.executed for one in loop]
         assert [step[-1]["reviser/executed_action"][0] for step in revised] == executed
     assert snapshot(env.guard.machine) == snapshot(guard.machine)
 
@@ -184,7 +180,6 @@ def test_where_nothing_is_ahead_a_usable_proposal_is_kept_and_nothing_is_learnt(
 
 def test_a_sensor_that_is_silent_is_named():
     env = RevisedActions(Script(*[[90.0, np.nan, 10.0]] * 150), guard_for(ONE))
-    env.reset()
     with pytest.warns(UserWarning, match=r"none of 100 observations .* is variable 2. .*sensor"):
         drive(env, lambda seen, info: np.array([0.0]))
 
@@ -299,9 +294,7 @@ def test_observations_become_a_vector(space, observation, observe, seen):
     script = Script(observation, observation)
     script.observation_space = space
     guard = guard_for(ONE)
-    env = RevisedActions(script, guard, observe)
-    env.reset()
-    env.step(np.array([0.0]))
+    drive(RevisedActions(script, guard, observe), lambda *_: np.array([0.0]))
     assert guard.judge.episodes == [([(seen, (0.0,))], seen, True)]
     if observe is not None:
         with pytest.raises(ValueError, match="give observe"):
@@ -377,9 +370,8 @@ def test_who_does_not_say_which_episodes_failed_is_told_both_ways_to():
 )
 def test_a_function_that_says_neither_yes_nor_no_of_a_step_is_told_so(failed, error, said):
     env = RevisedActions(Script(FAR, FAR), guard_for(ONE), failed=failed)
-    env.reset()
     with pytest.raises(error) as found:
-        env.step(np.array([0.0]))
+        drive(env, lambda *_: np.array([0.0]))
     assert said in "".join([str(found.value), *getattr(found.value, "__notes__", ())])
 
 
@@ -492,14 +484,9 @@ def test_who_is_attached_and_never_decides_says_so(way):
     else:
         env = RevisedActions(Over(FAR), *given)
     env.reset()
-
-    def silent():
-        for _ in range(220):
-            env.step(env.action_space.sample())
-
     why = way.removeprefix("many: ")
     with pytest.warns(UserWarning, match=f"nothing was decided in 200 steps on end: .*{why}"):
-        silent()
+        _ = [env.step(env.action_space.sample()) for _ in range(220)]
 
 
 def test_environments_that_take_turns_may_share_a_guard(monkeypatch):
