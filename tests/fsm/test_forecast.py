@@ -66,10 +66,8 @@ def test_states_created_later_are_taken_in(walk):
 
 
 def test_what_was_counted_of_a_merged_state_is_not_said_of_the_one_in_its_place():
-    machine, forecasts = (
-        EvolvingFSM(1, rule=Novelty(1.0, spread=0.3), max_states=9),
-        Forecasts(1, [1]),
-    )
+    machine = EvolvingFSM(1, rule=Novelty(1.0, spread=0.3), max_states=9)
+    forecasts = Forecasts(1, [1])
     for lap in range(40):
         Z = 2.0 * lap + np.resize([0.0, 3.0, 6.0, 9.0], (80, 1))
         machine.learn_many(Z, [0] * 80, [0])
