@@ -33,35 +33,23 @@ class Flickering(Guard):
         return super().recognise(np.where([gone, False, False], NAN, observation), time)
 
 
-def machine():
-    taught = EvolvingFSM(ACTIONS.n_actions, rule=Novelty(radius=1.0, scales=(4.0, 2.0, 2.0)))
-    rng = np.random.default_rng(0)
-    Z = np.array([40.0, 15.0, 15.0]) + np.cumsum(rng.normal(size=(300, 3)), axis=0)
-    taught.learn_many(Z, rng.integers(0, ACTIONS.n_actions, 300))
-    return taught
+def guard():
+    return guard_for_cars(-4.0, 2.5, judge=LatentRisk(-4.0, decel=4.0, leader_decel=8.0))
 
 
-def guard(learn=True, **options):
-    risk = LatentRisk(-4.0, decel=4.0, leader_decel=8.0)
-    reviser = ActionReviser(risk, ACTIONS)
-    return Guard.of(reviser, machine=machine(), learn=learn, interval=0.25, **options)
-
-
-def test_an_incomplete_observation_teaches_nothing_but_that_it_failed():
-    taught = machine()
-    centers, matrices, visits = taught.centers, taught.transition_matrices, taught.model().visits
-    taught.act(1)
-    step = taught.observe([NAN, 15.0, 15.0], partial=True)
+def test_an_incomplete_observation_teaches_nothing_but_that_it_failed(grown):
+    centers, matrices, visits = grown.centers, grown.transition_matrices, grown.model().visits
+    step = grown.observe([NAN, 0.5], partial=True)
     assert step.belief.sum() == pytest.approx(1.0, abs=1e-12)
     assert not np.isnan(step.surprise)  # it was foreseen, or not
-    np.testing.assert_array_equal(taught.centers, centers)
-    np.testing.assert_array_equal(taught.transition_matrices, matrices)
-    np.testing.assert_array_equal(taught.model().visits, visits)
-    np.testing.assert_array_equal(taught.belief, step.belief)
-    failures = taught.endings.sum()
-    taught.observe([NAN, 15.0, 15.0], partial=True, failed=True)
-    assert taught.endings.sum() == failures + 1
-    assert taught.state is None
+    np.testing.assert_array_equal(grown.centers, centers)
+    np.testing.assert_array_equal(grown.transition_matrices, matrices)
+    np.testing.assert_array_equal(grown.model().visits, visits)
+    np.testing.assert_array_equal(grown.belief, step.belief)
+    failures = grown.endings.sum()
+    grown.observe([NAN, 0.5], partial=True, failed=True)
+    assert grown.endings.sum() == failures + 1
+    assert grown.state is None
 
 
 def test_it_is_recognised_by_the_variables_that_are_there_and_else_by_the_forecast():
