@@ -64,28 +64,19 @@ def test_what_is_wrong_with_a_given_function_is_said_and_nothing_is_learnt(tmp_p
     assert "model was asked of [1.1 2. ], " in raised.value.__notes__[0]
 
 
-@pytest.mark.parametrize("n_actions", [2, None])
-def test_a_given_backup_is_fitted_for_choices_and_for_many_numbers(n_actions):
-    how = {"n_actions": 2} if n_actions else {"low": [-1.0] * 2, "high": [1.0] * 2}
-
+@pytest.mark.parametrize("name", ["choices", "plane"])
+def test_a_given_backup_is_fitted_for_choices_and_for_many_numbers(points, name):
     def backup(z):
-        return int(z[0] > 0.0) if n_actions else np.clip(-z, -1.0, 1.0)
+        return int(1.0 - np.sign(z[0])) if name == "choices" else np.clip(-4.0 * z[:2], -1.0, 1.0)
 
-    guard, rng = Guard(interval=0.1, backup=backup, **how), np.random.default_rng(0)
-    for k in range(3):
-        z = rng.normal(size=2)
-        for _ in range(30):
-            guard.decide(z, int(rng.integers(2)) if n_actions else rng.uniform(-1.0, 1.0, 2))
-            z = 0.9 * z + 0.3 * rng.normal(size=2)
-        guard.end(k == 0, z)
+    guard = points[name].taught(3, backup=backup)
     state, model = guard.judge.state, guard.judge.parts.model
     given = state.policies[state.linear == 2.0]
     assert len(given) == 1
-    for z in ([1.5, 0.0], [-1.5, 0.0]):
-        does = guard.judge.decode(action_of(model, given[0], np.array(z)))
-        assert np.sign(does[0] - 0.5 if n_actions else does[0]) == np.sign(
-            z[0] if n_actions else -z[0]
-        )
+    for place in (0.5, -0.5):
+        z = np.append(place, np.zeros(guard.judge.n_variables - 1))
+        push = guard.judge.decode(action_of(model, given[0], z))[0] - (name == "choices")
+        assert np.sign(push) == -np.sign(place)
 
 
 def test_a_function_that_covers_not_all_failures_is_said_to():
