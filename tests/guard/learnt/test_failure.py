@@ -5,6 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from studies.judges import run
+from studies.systems import Start, make_system
 
 from evofsm import Guard
 from evofsm.guard.learnt.failure import (
@@ -129,27 +131,11 @@ def test_of_flags_those_failures_count_in_which_they_were_set():
 # -- As guards learn them -----------------------------------------------------------------------
 
 
-def play(guard, episode):
-    """Walk in the plane towards random places, amid a disc; whether it failed."""
-    rng = np.random.default_rng(episode)
-    place, speed, said = rng.uniform([-2.0, -1.5], [-1.4, 1.5]), np.zeros(2), []
-    to = rng.uniform([1.4, -1.5], [2.0, 1.5])
-    for _ in range(60):
-        proposal = np.clip(0.7 * (to - place) - speed + 0.2 * rng.normal(size=2), -1.0, 1.0)
-        said.append(guard.decide([*place, *speed], proposal))
-        speed = speed + 0.1 * said[-1].executed + 0.004 * rng.normal(size=2)
-        place = place + 0.1 * speed
-        if np.hypot(*place) < 0.6:
-            break
-    failed = bool(np.hypot(*place) < 0.6)
-    guard.end(failed, [*place, *speed])
-    return said, failed
-
-
 def test_a_disc_is_learnt_said_and_no_threshold(snapshot, reloaded):
-    taught = Guard(-np.ones(2), np.ones(2), interval=0.1, horizon=2.0)
+    system = make_system("disc")
+    taught = Guard(-np.ones(2), np.ones(2), interval=system.interval, horizon=2.0)
     for episode in range(12):
-        play(taught, episode)
+        run(system, taught, Start.training(0, 0, episode))
     state = taught.judge.state
     assert (state.forms[:, SAYS] == FAILS).any()
     survived = np.concatenate([state.survived, state.brinks])
@@ -160,8 +146,8 @@ def test_a_disc_is_learnt_said_and_no_threshold(snapshot, reloaded):
     assert taught.told_here([-2.0, 1.5, 0.0, 0.0]) == ""
     again = reloaded(taught)
     assert snapshot(again) == snapshot(taught)
-    held = [play(again, 100 + episode) for episode in range(5)]
-    assert sum(failed for _, failed in held) <= 1
+    held = [run(system, again, Start.held_out(0, episode)) for episode in range(5)]
+    assert sum(one.failed for one in held) <= 1
 
 
 def test_a_rival_reaches_inwards_where_failures_lie_on_a_rim_that_was_skimmed():
