@@ -24,11 +24,6 @@ ACTIONS = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
 EMERGENCY = load_family("emergency")
 
 
-def test_a_judge_that_there_is_not_is_refused():
-    with pytest.raises(ValueError, match="no judge 'wise'; there are kinematic, learnt"):
-        guard_for_family(EMERGENCY, judge="wise")
-
-
 # -- What came of episodes ------------------------------------------------------------------------
 
 
@@ -51,7 +46,9 @@ def test_outcomes_compare_with_the_controller_alone():
     assert row.hours == pytest.approx(seconds / 3600.0)
 
 
-def test_nobody_drives_a_scenario_without_a_controller():
+def test_what_cannot_be_driven_is_refused():
+    with pytest.raises(ValueError, match="no judge 'wise'; there are kinematic, learnt"):
+        guard_for_family(EMERGENCY, judge="wise")
     scenario = EMERGENCY.draw(0, 0).scenario
     with pytest.raises(ValueError, match="nobody drives"):
         drive(unrevised_guard(EMERGENCY), scenario)
