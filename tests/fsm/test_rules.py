@@ -31,9 +31,8 @@ def test_what_is_no_rule_is_refused(rule):
 @pytest.mark.parametrize("table", [{"rule": 7}, {"radius": 1.0}, {"rule": 1, "radiu": 1.0}])
 def test_a_table_that_no_kernel_knows_is_refused(monkeypatch, table):
     monkeypatch.setattr(Paper, "table", table)
-    with pytest.raises(
-        ValueError, match=r"table of Paper\(\) is {.*its rule must be one of \(0, 1"
-    ):
+    words = r"table of Paper\(\) is {.*its rule must be one of \(0, 1"
+    with pytest.raises(ValueError, match=words):
         EvolvingFSM(1, rule=Paper())
     assert not check_results(Paper())[-1].passed
 

@@ -123,9 +123,8 @@ def test_what_has_no_switch_is_taken_out_as_long_as_it_is_asked():
 @pytest.mark.parametrize("wrong", [np.nan, -8.0])
 def test_what_a_judge_executes_is_an_action(wrong):
     judge = type("Rude", (Rival,), {"action": lambda *_: wrong})()
-    with pytest.raises(
-        ValueError, match=r"^Rude executed .* in place of 2.0, which is none of Box"
-    ):
+    words = r"^Rude executed .* in place of 2.0, which is none of Box"
+    with pytest.raises(ValueError, match=words):
         run(make_system("acc"), judge, Start.held_out(0, 0))
 
 
