@@ -6,7 +6,6 @@ import re
 from base64 import b64decode
 from collections.abc import Iterator
 from io import BytesIO
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -63,9 +62,9 @@ def _failure(file: Path, text: str) -> Any:
 
     if re.fullmatch(r"[\w.]+:[\w.]+", text):
         return imported(text)
-    guards = [record.content.get("guard") for record in islice(Chain(file).records(), 1)]
-    place = BytesIO(b64decode(next(filter(None, guards), "")))
-    names = load_guard(place).variables if place.getvalue() else ()
+    first = next(Chain(file).records(), None)
+    data = first and first.content.get("guard")
+    names = load_guard(BytesIO(b64decode(data))).variables if data else ()
     if (condition := failure(text, names)) is None:
         fault = f"the guard in {file} observes {', '.join(names) or 'what has no names'}"
         raise ValueError(f"--failed {text} is of other columns: {fault}")

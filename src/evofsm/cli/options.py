@@ -283,8 +283,7 @@ Horizon = Annotated[
     ),
 ]
 Persist = Annotated[
-    float,
-    option("Where nobody acts: how long a limit is passed [s], or 5min.", parser=duration),
+    float, option("Where nobody acts: how long a limit is passed [s], or 5min.", parser=duration)
 ]
 
 FalseADay = Annotated[

@@ -277,8 +277,7 @@ class Guarding:
 
     def begin_anew(self) -> None:
         """Another simulation, or another moment of it, begins."""
-        interval = None if self._template is None else self._template.interval
-        self.interval = self._seeing.dt if interval is None else interval
+        self.interval = self._seeing.dt if self._template is None else self._template.interval
         self._every = steps_between(self.interval, self._seeing.dt)
         self._steps = 0
         self._watches.clear()
@@ -320,10 +319,8 @@ class Guarding:
         ahead, before = self._seeing.neighbour(car.id, speed), car.around[0]
         scene = isinstance(judge := _judge(car.guard), TrafficRisk)
         # Who is behind matters only where one brakes: if acting, because somebody is ahead.
-        alone = ahead is None and self._acts
-        behind = None
-        if scene and not alone:
-            behind = self._seeing.neighbour(car.id, speed, is_ahead=False)
+        matters = scene and not (ahead is None and self._acts)
+        behind = self._seeing.neighbour(car.id, speed, is_ahead=False) if matters else None
         car.around = ahead, behind
         if (ahead and ahead.id) != (before and before.id):
             car.guard.begin()  # what is known of the one before does not hold of this one

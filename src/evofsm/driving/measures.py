@@ -221,8 +221,8 @@ class ResponsibilitySensitiveSafety(_Measure):
         """
         _, speed, leader_speed = _columns(observations)
         leader_way = _way_to_stop(leader_speed, self.leader_decel)
-        approach = -self._stopping_distance(-leader_speed)
-        leader_way = np.where(leader_speed < ONCOMING, approach, leader_way)
+        approach = self._stopping_distance(-leader_speed)
+        leader_way = np.where(leader_speed < ONCOMING, -approach, leader_way)
         return np.asarray(np.maximum(self._stopping_distance(speed) - leader_way, 0.0))
 
     def _stopping_distance(self, speed: Floats) -> Floats:

@@ -42,10 +42,7 @@ class Body(NamedTuple):
 
 @compiled
 def critical_decelerations(
-    observation: Three | Floats,
-    accelerations: Floats,
-    body: Body,
-    critical: Floats,
+    observation: Three | Floats, accelerations: Floats, body: Body, critical: Floats
 ) -> None:
     """Write the critical deceleration under each acceleration that could be commanded now."""
     for k in range(len(accelerations)):

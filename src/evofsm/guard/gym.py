@@ -575,18 +575,14 @@ def _conversions(space: Space[Any], actions: ActionSet) -> tuple[_Convert, _Conv
         )
     low, high = (np.reshape(end, space.shape) for end in (actions.low, actions.high))
     slack = 1e-6 * (high - low)  # what a float32 may round
+    ends = f"the guard's actions go from {actions.low} to {actions.high}"
     if (low < space.low - slack).any() or (high > space.high + slack).any():
-        raise ValueError(
-            f"the guard's actions go from {actions.low} to {actions.high}, beyond those of the "
-            f"environment, {space}; make a guard of the environment's low and high"
-        )
+        hint = "make a guard of the environment's low and high"
+        raise ValueError(f"{ends}, beyond those of the environment, {space}; {hint}")
     is_narrower = (low > space.low + slack) | (high < space.high - slack)
     if (is_narrower & np.isfinite(space.low) & np.isfinite(space.high)).any():
-        warnings.warn(
-            f"the guard's actions go from {actions.low} to {actions.high}, the environment's "
-            f"further, {space}: where it acts, those beyond are put at its edge, safe or not",
-            stacklevel=4,
-        )
+        fate = "where it acts, those beyond are put at its edge, safe or not"
+        warnings.warn(f"{ends}, the environment's further, {space}: {fate}", stacklevel=4)
 
     def to_guard(action: Any) -> Action:
         array = np.array(action, dtype=np.float64)

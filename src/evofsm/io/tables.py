@@ -101,9 +101,8 @@ def unit_of(text: str) -> str:
     ('km/h', 'm/s2', 'deg')
     """
     text = text.strip().strip("[]()<>").replace(" ", "").replace("²", "2").replace("^", "")
-    return next(
-        (name for name in (text, text.lower()) if name in UNITS), _SPELT.get(text.lower(), text)
-    )
+    names = [name for name in (text, text.lower()) if name in UNITS]
+    return names[0] if names else _SPELT.get(text.lower(), text)
 
 
 def quoted_name(text: str) -> tuple[str, str]:

@@ -293,18 +293,8 @@ def _car(lengths: VehicleLengths, place: Place, told: Mapping[str, str]) -> Vehi
     kind, heading = told.get("type", ""), cmath.rect(1.0, math.radians(90.0 - angle))
     length, width = lengths.size_of(kind)
     sizes = 0.0, length, width  # its place is that of the front bumper
-    fields = (
-        (told["lane"],),
-        told["id"],
-        complex(x, y),
-        heading,
-        speed,
-        *sizes,
-        along,
-        lateral,
-        kind,
-    )
-    return Vehicle(place, *fields)
+    where = place, [told["lane"]], told["id"], complex(x, y)
+    return Vehicle(*where, heading, speed, *sizes, along, lateral, kind)
 
 
 def fcd_of_xml(path: str, skips: Skips) -> Iterator[Moment]:
@@ -552,9 +542,7 @@ def _moment(osi: Any, place: str, data: bytes, is_view: bool) -> Moment:
     on_foot = (osi.MovingObject.Type.PEDESTRIAN, osi.MovingObject.Type.ANIMAL)
     vehicles = truth.moving_object if truth else ()
     kinds = [vehicle.vehicle_classification for vehicle in vehicles]
-    trailers = {
-        kind.trailer_id.value for kind in kinds if kind and kind.has_trailer and kind.trailer_id
-    }
+    trailers = {k.trailer_id.value for k in kinds if k and k.has_trailer and k.trailer_id}
     entries: list[tuple[Place, Mapping[str, Any]]] = [
         (lambda: place, _row_of(vehicle) | {"towed": vehicle.id and vehicle.id.value in trailers})
         for vehicle in vehicles

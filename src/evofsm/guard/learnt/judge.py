@@ -255,12 +255,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         return Remembered(len(self.state.windows), seconds, lost=(int(ends.sum()), len(ends)))
 
     def search(
-        self,
-        situation: Situation,
-        wanted: Any,
-        *,
-        tolerance: float,
-        mask: Mask | None = None,
+        self, situation: Situation, wanted: Any, *, tolerance: float, mask: Mask | None = None
     ) -> Search:
         """An action near ``wanted`` that passes, or else that of the longest-lasting backup.
 
