@@ -267,10 +267,9 @@ def drive_at_once(
             move(len(results.rows))
         return results.summed_up(episodes)
     except BrokenExecutor:
-        raise ChildProcessError(
-            "a worker died (out of memory? fewer --workers need less); with --out what was driven "
-            "is kept, and the same command goes on from there"
-        ) from None
+        fault = "a worker died (out of memory? fewer --workers need less)"
+        hint = "with --out what was driven is kept, and the same command goes on from there"
+        raise ChildProcessError(f"{fault}; {hint}") from None
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
 

@@ -93,10 +93,9 @@ def learn_traces(
     model = machine.model(actions=actions, names=names, units=units(), dt=step)
     counts["transitions"] = int(model.uses.sum())
     if not counts["transitions"]:
-        raise ValueError(
-            "no transition could be learnt: no row with an action is followed by another row of "
-            "its episode (is every row an episode? are the rows sorted by episode and time?)"
-        )
+        fault = "no row with an action is followed by another row of its episode"
+        cause = "is every row an episode? are the rows sorted by episode and time?"
+        raise ValueError(f"no transition could be learnt: {fault} ({cause})")
     return Learning(model, machine, actions, counts, seconds, levels)
 
 
@@ -318,10 +317,9 @@ def _scales(scale: list[str] | None, encoder: ObservationEncoder) -> list[float]
         raise ValueError(f"--scale names {unknown[0]!r}; observed are {', '.join(single)}")
     scales = dict(zip(VARIABLES, SAFETY_RULE.scales, strict=True)) | scales
     if omissions := [column for column in single if column not in scales]:
-        raise ValueError(
-            f"--rule novelty has to know the difference that counts as 1 in {omissions[0]!r}: "
-            f"--scale {quote(omissions[0])}=NUMBER, a fifth of what it spans or so"
-        )
+        fault = f"--rule novelty has to know the difference that counts as 1 in {omissions[0]!r}"
+        hint = f"--scale {quote(omissions[0])}=NUMBER, a fifth of what it spans or so"
+        raise ValueError(f"{fault}: {hint}")
     return [scales.get(name, 1.0) for name in encoder.names]
 
 
@@ -339,10 +337,9 @@ def judge_of(judge: Judge | None, columns: LogColumns) -> Judge:
     judge = judge or ("kinematic" if names == VARIABLES else "learnt")
     judge = judge if columns.acts else "learnt"
     if judge == "kinematic" and len(names) != len(VARIABLES):
-        raise ValueError(
-            f"--judge kinematic knows cars by their {', '.join(VARIABLES)}; --observe has to name "
-            f"the three columns in this order, and names {', '.join(names)}"
-        )
+        kind = f"--judge kinematic knows cars by their {', '.join(VARIABLES)}"
+        fault = f"has to name the three columns in this order, and names {', '.join(names)}"
+        raise ValueError(f"{kind}; --observe {fault}")
     if judge == "learnt" and columns.failed is None:
         raise ValueError(
             "--guard learns from failures, and which there were is not known: --failed COLUMN or "

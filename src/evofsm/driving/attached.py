@@ -259,10 +259,9 @@ class Guarding:
         self._watches: dict[str, tuple[BrakeWatch, Manoeuvres]] = {}
         judge = None if guard is None else _judge(guard)
         if not (judge is None or isinstance(judge, TrafficRisk) or judge.labels.names == VARIABLES):
-            raise ValueError(
-                f"the guard's judge observes {judge.labels.names or 'unnamed variables'}; it must "
-                f"be a TrafficRisk, or observe {', '.join(VARIABLES)}"
-            )
+            names = judge.labels.names or "unnamed variables"
+            hint = f"it must be a TrafficRisk, or observe {', '.join(VARIABLES)}"
+            raise ValueError(f"the guard's judge observes {names}; {hint}")
         #: How hard leaders were seen to brake, by their ``decel`` [m/s²].
         self.leaders: dict[float, Manoeuvres] = {}
         self.begin_anew()
@@ -485,10 +484,9 @@ def choose(vehicles: str | float | Iterable[str]) -> Callable[[Any, str], bool]:
         except ValueError:
             share = math.nan
         if not 0.0 < share <= 1.0 or vehicles == "1":  # which is an id
-            raise ValueError(
-                f"vehicles is {vehicles!r}; it is 'all', 'type:NAME', a share above 0 up to 1, "
-                "such as 0.1 or '10%', or a list of ids"
-            )
+            shares = "a share above 0 up to 1, such as 0.1 or '10%'"
+            hint = f"it is 'all', 'type:NAME', {shares}, or a list of ids"
+            raise ValueError(f"vehicles is {vehicles!r}; {hint}")
         most = share * 2.0**64  # of a hash that mixes: crc32 has numbered ids in or out together
         return lambda _, car: int.from_bytes(blake2b(car.encode(), digest_size=8).digest()) < most
     ids = frozenset(vehicles)

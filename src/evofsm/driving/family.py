@@ -201,19 +201,15 @@ class Family:
         where, leader = self.source or f"family {self.name}", scenario.leader
         leader_brakes = max([leader.brake_decel, *(-wave for _, wave in leader.waves)])
         if leader_brakes > self.leader_decel + _ROUNDING:
-            raise ValueError(
-                f"{where}: a leader brakes by {leader_brakes:g} m/s², but leader_decel is "
-                f"{self.leader_decel:g}"
-            )
+            fault = f"a leader brakes by {leader_brakes:g} m/s²"
+            raise ValueError(f"{where}: {fault}, but leader_decel is {self.leader_decel:g}")
         if not isinstance(driver, IDM | ChangingIDM):
             raise ValueError(f"{where}: who drives is {driver!r}; make gives an IDM or ChangingIDM")
         lowest_command = min(self.low, float(driver.parameters[:, 7].min()))
         brakes = -max(scenario.body.lowest, lowest_command)
         if brakes > self.decel + _ROUNDING:
-            raise ValueError(
-                f"{where}: the follower can brake by {brakes:g} m/s², but decel is "
-                f"{self.decel:g}; bound its body, or the driver and the actions"
-            )
+            fault = f"the follower can brake by {brakes:g} m/s², but decel is {self.decel:g}"
+            raise ValueError(f"{where}: {fault}; bound its body, or the driver and the actions")
 
     def __reduce_ex__(self, protocol: SupportsIndex) -> Any:
         """From a file it is read anew in other processes, which do not know its functions."""

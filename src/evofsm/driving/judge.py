@@ -320,15 +320,11 @@ class LatentRisk(Retraced, LearningJudge):
     def refuse_unfit(self, actions: ActionSet) -> None:
         """Raise a ValueError if it counts on harder braking than there is."""
         if isinstance(actions, BoxActions):
-            raise ValueError(
-                "the risk judges one acceleration, but an action is a vector of "
-                f"{len(actions.low)}; give low and high as numbers"
-            )
+            fault = f"an action is a vector of {len(actions.low)}; give low and high as numbers"
+            raise ValueError(f"the risk judges one acceleration, but {fault}")
         if self.lowest < actions.low:
-            raise ValueError(
-                f"the risk counts on braking down to {self.lowest:g}, but the set of "
-                f"actions ends at {actions.low:g}"
-            )
+            fault = f"the set of actions ends at {actions.low:g}"
+            raise ValueError(f"the risk counts on braking down to {self.lowest:g}, but {fault}")
 
     def _cautious(self, observation: ArrayLike) -> Three:
         """The situation as it most likely is, but closer by what is not sure about it."""
@@ -485,10 +481,8 @@ def _three_finite(observation: ArrayLike, *, whole: bool = True) -> Three:
     """Gap and speeds, as they can be judged; unless they must be ``whole``, NaN where not seen."""
     numbers = real_array("observation", observation, 1)
     if len(numbers) != 3:
-        raise ValueError(
-            f"observation has shape {numbers.shape}; it must be (3,): gap, speed of the follower "
-            "and of the leader"
-        )
+        hint = "it must be (3,): gap, speed of the follower and of the leader"
+        raise ValueError(f"observation has shape {numbers.shape}; {hint}")
     gap, speed, leader_speed = numbers.tolist()
     if not math.isfinite(gap + speed + leader_speed):  # looked at closely only where it has to be
         refuse_unusable("observation", numbers if whole else numbers[~np.isnan(numbers)])

@@ -114,10 +114,8 @@ class Scenario:
     def __post_init__(self) -> None:
         refuse_others(self, "scenario's", "initial_gap duration dt", "initial_speed")
         if self.duration < 2 * self.dt:
-            raise ValueError(
-                f"scenario's duration is {self.duration} and its dt {self.dt}; "
-                "it must last two steps or more"
-            )
+            times = f"scenario's duration is {self.duration} and its dt {self.dt}"
+            raise ValueError(f"{times}; it must last two steps or more")
 
     @property
     def times(self) -> Floats:
@@ -133,8 +131,6 @@ def steps_between(interval: float, dt: float) -> int:
     """How many steps lie between two decisions; a ValueError where they are no multiple."""
     steps = round(interval / dt)
     if steps < 1 or not math.isclose(steps * dt, interval):
-        raise ValueError(
-            f"the interval between decisions is {interval:g} s, which is no multiple of the "
-            f"simulation's step of {dt:g} s"
-        )
+        fault = f"no multiple of the simulation's step of {dt:g} s"
+        raise ValueError(f"the interval between decisions is {interval:g} s, which is {fault}")
     return steps

@@ -79,10 +79,8 @@ class SumoWorld(World, AbstractContextManager["SumoWorld"]):
         _refuse_what_sumo_cannot_drive(scenario)
         sumo = self._sumo
         if sumo.isLoaded():
-            raise RuntimeError(
-                "this process runs a SUMO simulation already, and libsumo has room for one: "
-                "close that one, or use another process"
-            )
+            fault = "this process runs a SUMO simulation already, and libsumo has room for one"
+            raise RuntimeError(f"{fault}: close that one, or use another process")
         with tempfile.TemporaryDirectory(prefix="evofsm-sumo-") as folder:
             net, routes = Path(folder) / "road.net.xml", Path(folder) / "road.rou.xml"
             net.write_text(_NET)
@@ -117,17 +115,14 @@ def open_world(name: str) -> World:
 def _refuse_what_sumo_cannot_drive(scenario: Scenario) -> None:
     milliseconds = scenario.dt * 1000.0
     if round(milliseconds) < 1 or abs(milliseconds - round(milliseconds)) > 1e-9:
-        raise ValueError(
-            f"dt is {scenario.dt} s, but SUMO's clock counts whole milliseconds: it would drive "
-            "another step; choose one of 0.001 s, 0.002 s, ..., or the kinematic world"
-        )
+        fault = "SUMO's clock counts whole milliseconds: it would drive another step"
+        hint = "choose one of 0.001 s, 0.002 s, ..., or the kinematic world"
+        raise ValueError(f"dt is {scenario.dt} s, but {fault}; {hint}")
     # Nobody is faster than this; what the leader needs, the follower does not exceed.
     farthest = _start(scenario) + scenario.initial_gap + _FASTEST * scenario.duration
     if farthest > _ROAD_LENGTH:
-        raise ValueError(
-            f"initial_gap {scenario.initial_gap:g} m and duration {scenario.duration:g} s may lead "
-            f"beyond the road's {_ROAD_LENGTH:g} m"
-        )
+        cause = f"initial_gap {scenario.initial_gap:g} m and duration {scenario.duration:g} s"
+        raise ValueError(f"{cause} may lead beyond the road's {_ROAD_LENGTH:g} m")
 
 
 def _start(scenario: Scenario) -> float:

@@ -96,10 +96,8 @@ class BoxActions:
                 raise ValueError(f"{name} is {tuple(array.tolist())}; it must be finite")
             object.__setattr__(self, name, tuple(array.tolist()))
         if len(self.low) != len(self.high):
-            raise ValueError(
-                f"low has {len(self.low)} components and high has {len(self.high)}; an action has "
-                "as many of both"
-            )
+            counts = f"low has {len(self.low)} components and high has {len(self.high)}"
+            raise ValueError(f"{counts}; an action has as many of both")
         for k, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
             if not low < high:
                 raise ValueError(
@@ -216,10 +214,9 @@ def checked_mask(actions: ActionSet, mask: ArrayLike | None) -> Mask | None:
         return None
     flags = np.asarray(mask).astype(np.bool_)
     if not isinstance(actions, Choices) or flags.shape != (actions.n_actions,):
-        raise ValueError(
-            f"the mask of allowed actions has shape {flags.shape}, but the guard has {actions}; "
-            "it must have an entry for each of Choices"
-        )
+        fault = f"has shape {flags.shape}, but the guard has {actions}"
+        hint = "it must have an entry for each of Choices"
+        raise ValueError(f"the mask of allowed actions {fault}; {hint}")
     return flags if 0 < flags.sum() < len(flags) else None
 
 

@@ -288,10 +288,8 @@ class Ledger:
         for record in chain.records():
             take(record.content)
         if chain.finding is not None:
-            raise ValueError(
-                f"{self.path} was tampered with, and is left as it is: "
-                f"{chain.finding.explanation}; {self._remedy}"
-            )
+            fault = f"was tampered with, and is left as it is: {chain.finding.explanation}"
+            raise ValueError(f"{self.path} {fault}; {self._remedy}")
         prefix = f'{{"about":"{self._about}",'.encode()
         self._file.seek(0)
         if not prefix.startswith(self._file.read(len(prefix))):

@@ -80,10 +80,8 @@ def write_c99(guard: Guard, folder: Path, prefix: str = "evofsm") -> None:
     """
     is_name = re.fullmatch("[A-Za-z](_?[A-Za-z0-9])*(?<!_t)", prefix)
     if not is_name or prefix.lower() in _TAKEN.split():
-        raise ValueError(
-            f"the prefix {prefix!r} begins no name in C and C++, or is one of theirs: take "
-            "letters, digits and single _, such as my_guard"
-        )
+        fault = f"the prefix {prefix!r} begins no name in C and C++, or is one of theirs"
+        raise ValueError(f"{fault}: take letters, digits and single _, such as my_guard")
     texts = _texts(guard)
     folder.mkdir(parents=True, exist_ok=True)
     with ExitStack() as files:  # all are written before one takes its place
@@ -126,19 +124,16 @@ def _texts(guard: Guard, unit: str = "") -> dict[str, str]:
     frozen.freeze()
     reviser, judge_class = frozen.reviser, type(getattr(frozen.reviser, "risk", None))
     if type(reviser) is not ActionReviser or reviser.mode is Mode.OFF:
-        raise ValueError(
-            "only a guard with an ActionReviser whose mode is not off is exported, not one of "
-            f"{type(reviser).__name__}{' in mode off' * hasattr(reviser, 'mode')}"
-        )
+        kind = f"{type(reviser).__name__}{' in mode off' * hasattr(reviser, 'mode')}"
+        text = "only a guard with an ActionReviser whose mode is not off is exported"
+        raise ValueError(f"{text}, not one of {kind}")
     labels = reviser.risk.labels
     names, units = _told(labels.names), _told(labels.units)
     reviser.risk.labels = labels._replace(names=names, units=units)
     frozen.begin()
     if reviser.passing:
-        raise ValueError(
-            f"this guard {reviser.passing}: exported it would let all proposals pass; let it learn "
-            "on, or set guard.shadow = False"
-        )
+        fault = f"this guard {reviser.passing}: exported it would let all proposals pass"
+        raise ValueError(f"{fault}; let it learn on, or set guard.shadow = False")
     if not reviser.acts:
         note = "exported in mode %s it watches: executed is always the proposal; --mode act filters"
         logging.getLogger(__name__).warning(note, reviser.mode.value)

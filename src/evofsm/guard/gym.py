@@ -518,16 +518,14 @@ def _flat(space: Space[Any]) -> Observe:
         return lambda seen: np.concatenate([part(seen[key]) for key, part in parts.items()])
     if isinstance(space, Discrete):
         if space.n > _MOST_VALUES:
-            raise ValueError(
-                f"the environment's observations are {space}: each of {space.n} values would be a "
-                f"variable, of at most {_MOST_VALUES}; give observe, which makes few (row, column)"
-            )
+            fault = f"each of {space.n} values would be a variable, of at most {_MOST_VALUES}"
+            hint = "give observe, which makes few (row, column)"
+            raise ValueError(f"the environment's observations are {space}: {fault}; {hint}")
         first, unit = int(space.start), np.eye(int(space.n))
         return lambda observation: unit[int(observation) - first]
-    raise ValueError(
-        f"the environment's observations are {space}, neither Box, MultiBinary nor Discrete, nor "
-        "a Dict or Tuple of these; give observe, which makes a vector of them"
-    )
+    fault = "neither Box, MultiBinary nor Discrete, nor a Dict or Tuple of these"
+    hint = "give observe, which makes a vector of them"
+    raise ValueError(f"the environment's observations are {space}, {fault}; {hint}")
 
 
 def _sizes(space: Any) -> list[int]:

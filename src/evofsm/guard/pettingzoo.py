@@ -119,10 +119,9 @@ class RevisedAgents(gym._Settled, BaseParallelWrapper[Any, Any, Any]):  # type: 
         lanes = self._lanes.items() if agents else ()
         sizes = {agent: len(lane.seen) for agent, lane in lanes if lane.seen is not None}
         if len({*sizes.values()}) > 1:
-            raise ValueError(
-                f"agents observe different numbers of variables, {sizes}, and a guard observes one "
-                "kind: give observe= that makes them alike"
-            )
+            fault = f"agents observe different numbers of variables, {sizes}"
+            hint = "a guard observes one kind: give observe= that makes them alike"
+            raise ValueError(f"{fault}, and {hint}")
 
     def _enter(self, agent: Any) -> Lane:
         if agent not in self._lanes:

@@ -145,10 +145,8 @@ class SceneRisk(LearningJudge, SearchingJudge):
         self.labels = Labels(dt=self.dt)
         self.columns = whole("columns", columns)
         if self.columns < 2 + _P:
-            raise ValueError(
-                f"columns is {columns}; a row holds whether it is in use, two numbers of a place, "
-                "and something else, such as a speed"
-            )
+            fields = "whether it is in use, two numbers of a place, and something else"
+            raise ValueError(f"columns is {columns}; a row holds {fields}, such as a speed")
         self.relative = relative
         #: What was learnt.
         self.memory = Memory(operator.index(n_actions), self.columns - 1 - _P)
@@ -157,10 +155,8 @@ class SceneRisk(LearningJudge, SearchingJudge):
     def refuse_unfit(self, actions: ActionSet) -> None:
         """Raise a ValueError if there are other actions than it was made for."""
         if (actions.low, actions.high) != (0.0, self.memory.n_actions - 1.0):
-            raise ValueError(
-                f"the judge was made for {self.memory.n_actions} choices, but actions lie from "
-                f"{actions.low} to {actions.high}"
-            )
+            fault = f"actions lie from {actions.low} to {actions.high}"
+            raise ValueError(f"the judge was made for {self.memory.n_actions} choices, but {fault}")
 
     def search(
         self, situation: Situation, wanted: Action, *, tolerance: float, mask: Mask | None = None

@@ -160,10 +160,8 @@ def to_prism(model: FSMModel, evidence: float = 1.0, least: float = 0.0) -> str:
     if not evidence > 0.0:
         raise ValueError(f"evidence is {evidence}; it must be positive")
     if not model.decisions.any():
-        raise ValueError(
-            "the model counted no decisions, so there is no action to choose (has its machine been "
-            "told its actions?)"
-        )
+        fault = "the model counted no decisions, so there is no action to choose"
+        raise ValueError(f"{fault} (has its machine been told its actions?)")
     body, unknown = list[str](), list[int]()
     arrivals = model.changes @ model.recognise(model.centers)  # and what is believed beside it
     for state in range(n):

@@ -187,10 +187,8 @@ def units_of(units: Mapping[str, str], used: Sequence[str]) -> dict[str, str]:
     for name in sorted(units, key=lambda name: (name in used, len(name))):
         fit = [name] if name in used else [column for column in used if column.startswith(name)]
         if not fit:
-            raise ValueError(
-                f"--unit {name}={units[name]}: no column that is read is called so, or begins so; "
-                f"read are {', '.join(used)}"
-            )
+            fault = "no column that is read is called so, or begins so"
+            raise ValueError(f"--unit {name}={units[name]}: {fault}; read are {', '.join(used)}")
         column_units |= dict.fromkeys(fit, units[name])
     return column_units
 
@@ -739,24 +737,19 @@ class _Clock:
         self._usual = usual
         if self._resampled:
             if usual > LONGEST_STEP * self.dt:
-                raise ValueError(
-                    f"{self._path} has a row every {usual:g} s, and --resample makes one every "
-                    f"{self.dt:g} s, of which most would be holes: --resample {usual:g}s at least"
-                )
+                steps = f"a row every {usual:g} s, and --resample makes one every {self.dt:g} s"
+                hint = f"--resample {usual:g}s at least"
+                raise ValueError(f"{self._path} has {steps}, of which most would be holes: {hint}")
             return
         if usual <= 0.0:
-            raise ValueError(
-                f"{self._path}: a row follows the one before within less than a nanosecond; the "
-                "time must be in seconds"
-            )
+            fault = "a row follows the one before within less than a nanosecond"
+            raise ValueError(f"{self._path}: {fault}; the time must be in seconds")
         if np.isnan(self.dt):
             self.dt, self._first_path = usual, self._path
         if not abs(usual / self.dt - 1.0) < _SAME_STEP:
-            raise ValueError(
-                f"{self._path} has a row every {usual:g} s, but {self._first_path} has one every "
-                f"{self.dt:g} s; a machine knows only one step: --resample "
-                f"{2.0 * max(usual, self.dt):g}s, or learn them apart"
-            )
+            steps = f"a row every {usual:g} s, but {self._first_path} has one every {self.dt:g} s"
+            hint = f"--resample {2.0 * max(usual, self.dt):g}s, or learn them apart"
+            raise ValueError(f"{self._path} has {steps}; a machine knows only one step: {hint}")
 
 
 class _Reader:

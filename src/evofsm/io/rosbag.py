@@ -218,10 +218,8 @@ class BagTable(Table):
         with readable(self.path, "a bag of ROS 2 (damaged, cut off, or still being recorded?)"):
             numbers = self._held(self._messages())
         if not len(numbers["time"]):
-            raise ValueError(
-                f"{self.path}: at no time are all variables known, none older than "
-                f"{self._topics.oldest:g} s (oldest in the file of --topics)"
-            )
+            age = f"none older than {self._topics.oldest:g} s (oldest in the file of --topics)"
+            raise ValueError(f"{self.path}: at no time are all variables known, {age}")
         find = partial(in_row, self.path, numbers, 0)
         yield Piece(len(numbers["time"]), numbers, find, self.skips, starts=[0])
 

@@ -207,10 +207,8 @@ class Source(AbstractContextManager["Source"]):
             quotes += line.count(b'"')
             if len(block) > most and not line.endswith(b"\n"):
                 where = f"line {self.lines}" if self._packed else f"byte {self._raw.tell():,}"
-                raise ValueError(
-                    f"{self.path}, about {where}: a line of more than {_LONGEST_LINE:,} bytes; "
-                    "this is no table"
-                )
+                fault = f"a line of more than {_LONGEST_LINE:,} bytes; this is no table"
+                raise ValueError(f"{self.path}, about {where}: {fault}")
         return bytes(block)
 
     def _take(self, most: int, to_line_end: bool = False) -> bytes:
@@ -503,10 +501,9 @@ class CsvTable(Table):
         pattern = f'"[^"{dialect.separator}\\r\\n]*"(?=[{dialect.separator}\\r\\n])'
         self._quoted = re.compile(pattern.encode())
         if any(map(is_date, self.columns)) or all(map(is_number, self.columns)):
-            raise ValueError(
-                f"{path}, line {at + 1}: {header.strip()[:200]!r} is no header; a line above the "
-                "rows must name the columns"
-            )
+            hint = "a line above the rows must name the columns"
+            fault = f"{header.strip()[:200]!r} is no header; {hint}"
+            raise ValueError(f"{path}, line {at + 1}: {fault}")
 
     def _header(self, lines: Sequence[str], names: set[str]) -> int:
         """Which line names the columns: the one with most names, or the last before the rows."""
@@ -649,10 +646,9 @@ class CsvTable(Table):
         """Whether a row is no row but names the columns once more."""
         omissions = set(wanted.all).difference(_names(fields))
         if omissions and len(wanted.all) - len(omissions) > 1:
-            raise ValueError(
-                f"{self.path}, line {line}: it names the columns anew, without {min(omissions)!r} "
-                "(two logs in one file? learn them apart)"
-            )
+            fault = f"it names the columns anew, without {min(omissions)!r}"
+            hint = "two logs in one file? learn them apart"
+            raise ValueError(f"{self.path}, line {line}: {fault} ({hint})")
         return not omissions
 
     def _find(self, here: Callable[[], _Odd], wanted: Wanted, row: int) -> tuple[str, Any]:
@@ -720,10 +716,8 @@ def decoded(block: bytes, path: str, reached: int = 0) -> str:
         if not _CONTROL.search(block):
             return block.decode("cp1252", errors="replace")
         line = reached + block.count(b"\n", 0, error.start)
-        raise ValueError(
-            f"{path}, after line {line}: this is not text in UTF-8 (a file of another "
-            "kind, or saved in another encoding?)"
-        ) from error
+        fault = "not text in UTF-8 (a file of another kind, or saved in another encoding?)"
+        raise ValueError(f"{path}, after line {line}: this is {fault}") from error
 
 
 def _count(block: bytes | bytearray, byte: bytes) -> int:

@@ -207,10 +207,9 @@ def _ahead(
             yield leader, leader.along - car.along, leader.along - car.along
         return
     if len(lane) > _MOST_ON_A_LANE:
-        raise ValueError(
-            f"{car.where()}: {len(lane):,} objects on the lane {car.lanes[0][:40]!r} at one time "
-            "(rows not sorted by time, or the clock of a coarse step?)"
-        )
+        fault = f"{len(lane):,} objects on the lane {car.lanes[0][:40]!r} at one time"
+        cause = "rows not sorted by time, or the clock of a coarse step?"
+        raise ValueError(f"{car.where()}: {fault} ({cause})")
     apart = places - car.place
     along, distances = (apart * car.heading.conjugate()).real, np.abs(apart)
     for place in np.argsort(distances).tolist():
@@ -272,10 +271,9 @@ class VehicleLengths:
         """Raise if a length was given for a type that no vehicle had: most likely a slip."""
         for kind in self.lengths:
             if kind and kind not in self.seen:
-                raise ValueError(
-                    f"no vehicle has the type {kind!r} of --vehicle-length; the types "
-                    f"are {', '.join(sorted(self.seen)) or 'not in the file'}"
-                )
+                kinds = ", ".join(sorted(self.seen)) or "not in the file"
+                fault = f"no vehicle has the type {kind!r} of --vehicle-length"
+                raise ValueError(f"{fault}; the types are {kinds}")
 
     def __str__(self) -> str:
         texts = [f"{kind} {length:g} m" for kind, length in self.lengths.items() if kind]
@@ -305,10 +303,8 @@ def fcd_of_xml(path: str, skips: Skips) -> Iterator[Moment]:
     depth, whole = 0, list[Moment]()
 
     def refuse(why: str) -> NoReturn:
-        raise ValueError(
-            f"{path}, line {parser.CurrentLineNumber}: {why}; SUMO writes no such thing (is this "
-            "another program's file?)"
-        )
+        hint = "SUMO writes no such thing (is this another program's file?)"
+        raise ValueError(f"{path}, line {parser.CurrentLineNumber}: {why}; {hint}")
 
     def start(name: str, attributes: dict[str, str]) -> None:
         nonlocal depth, step
@@ -316,10 +312,9 @@ def fcd_of_xml(path: str, skips: Skips) -> Iterator[Moment]:
         if depth > _DEEPEST:
             refuse(f"there are more than {_DEEPEST} tags within each other")
         if depth == 1 and name != "fcd-export":
-            raise ValueError(
-                f"{path} is XML but not SUMO's FCD output: it begins with <{name[:40]}> instead of "
-                "<fcd-export> (written with another option than --fcd-output?)"
-            )
+            fault = f"it begins with <{name[:40]}> instead of <fcd-export>"
+            cause = "written with another option than --fcd-output?"
+            raise ValueError(f"{path} is XML but not SUMO's FCD output: {fault} ({cause})")
         place = partial("{}, line {}".format, path, parser.CurrentLineNumber)
         if name == "timestep":
             step = _number(place, "time", attributes.get("time")), place, []
@@ -419,10 +414,8 @@ def _number(place: Place, name: str, text: str | None) -> float:
 
 
 def _refuse_lack(place: str, name: str) -> NoReturn:
-    raise ValueError(
-        f"{place}: there is no {name!r}; SUMO writes it unless --fcd-output.attributes leaves it "
-        "out (id,lane,pos,speed,type are needed)"
-    )
+    why = "SUMO writes it unless --fcd-output.attributes leaves it out"
+    raise ValueError(f"{place}: there is no {name!r}; {why} (id,lane,pos,speed,type are needed)")
 
 
 # -- Objects --------------------------------------------------------------------------------------
@@ -445,10 +438,8 @@ def _object(place: Place, told: Mapping[str, Any]) -> Vehicle:
     numbers = x, y, vx, vy, length = [told[name] for name in ("x", "y", "vx", "vy", "length")]
     name, heading, width = told["id"], told.get("heading", math.nan), told.get("width", math.nan)
     if not (all(abs(number) <= LARGEST_OBSERVATION for number in numbers) and length > 0.0):
-        raise ValueError(
-            f"{place()}: object {name[:40]} is {length:g} m long, at ({x:g}, {y:g}) m, with "
-            f"({vx:g}, {vy:g}) m/s; it needs a length and numbers"
-        )
+        fault = f"{length:g} m long, at ({x:g}, {y:g}) m, with ({vx:g}, {vy:g}) m/s"
+        raise ValueError(f"{place()}: object {name[:40]} is {fault}; it needs a length and numbers")
     speed, half = math.hypot(vx, vy), 0.5 * length
     if not math.isfinite(heading):
         heading = math.atan2(vy, vx) if speed >= _TURNS_ABOVE else math.nan
@@ -487,10 +478,9 @@ def _of_file(path: str, osi: Any, skips: Skips) -> Iterator[tuple[bytes, bool]]:
             number += 1
             size = _LENGTH.unpack(head)[0] if len(head) == _LENGTH.size else 0
             if size > _MOST_BYTES:
-                raise ValueError(
-                    f"{path}, message {number}: {size:,} bytes long by what stands before it; "
-                    "this is no trace of OSI, or it is damaged there"
-                )
+                fault = f"{size:,} bytes long by what stands before it"
+                cause = "this is no trace of OSI, or it is damaged there"
+                raise ValueError(f"{path}, message {number}: {fault}; {cause}")
             data = source.read(size)
             if len(head) < _LENGTH.size or len(data) < size:
                 why = "(was a copy or a simulation interrupted?)"
@@ -523,20 +513,18 @@ def _of_mcap(path: str, skips: Skips) -> Iterator[tuple[bytes, bool]]:
             yield message.data, kind == "SensorView"
     if channel_id is None:
         names = ", ".join(sorted(kinds - {""})) or "none"
-        skips.refuse_nothing(
-            f"{path}: no channel of it holds GroundTruth or SensorView of OSI; its schemas are "
-            f"{names} (of a bag of ROS 2 --topics says what they mean, whatever its header says)"
-        )
+        fault = f"no channel of it holds GroundTruth or SensorView of OSI; its schemas are {names}"
+        hint = "of a bag of ROS 2 --topics says what they mean, whatever its header says"
+        skips.refuse_nothing(f"{path}: {fault} ({hint})")
 
 
 def _moment(osi: Any, place: str, data: bytes, is_view: bool) -> Moment:
     try:
         message = (osi.SensorView if is_view else osi.GroundTruth).from_binary(data)
     except ValueError as error:
-        raise ValueError(
-            f"{place} is not ground truth of OSI, nor a sensor view (damaged, or a trace of "
-            f"another message?): {error}"
-        ) from error
+        cause = "damaged, or a trace of another message?"
+        fault = f"is not ground truth of OSI, nor a sensor view ({cause})"
+        raise ValueError(f"{place} {fault}: {error}") from error
     truth = message.global_ground_truth if is_view else message
     stamp = (truth and truth.timestamp) or message.timestamp or osi.Timestamp()
     on_foot = (osi.MovingObject.Type.PEDESTRIAN, osi.MovingObject.Type.ANIMAL)

@@ -55,21 +55,17 @@ class State:
             self._provenance = dict(store.read_header(self.path).provenance)
         self._saved = self._provenance.pop(_PROVENANCE, {})
         if not self._saved and journal.records:
-            raise ValueError(
-                f"{journal.path} holds what came after a guard that is not in {self.path}; put "
-                "that back, or delete the journal to begin anew"
-            )
+            fault = f"holds what came after a guard that is not in {self.path}"
+            hint = "put that back, or delete the journal to begin anew"
+            raise ValueError(f"{journal.path} {fault}; {hint}")
         if self._saved and (changes := differences(self._saved["settings"], self.settings)):
-            raise ValueError(
-                f"{self.path} was saved with other settings: {changes}; go on with those, or name "
-                "another file"
-            )
+            fault = f"{self.path} was saved with other settings: {changes}"
+            raise ValueError(f"{fault}; go on with those, or name another file")
         self._mark, self._files = self._saved.get("mark", 0), self._saved.get("files", [])
         if self._saved and journal.settings.get("mark") not in (self._mark, self._mark - 1):
-            raise ValueError(
-                f"{journal.path} is missing or empty: rows that came after {self.path} was saved "
-                "are lost; put it back, or give the guard as --guard and name another --state"
-            )
+            fault = f"is missing or empty: rows that came after {self.path} was saved are lost"
+            hint = "put it back, or give the guard as --guard and name another --state"
+            raise ValueError(f"{journal.path} {fault}; {hint}")
         for record in journal.records:
             self._have_read(*record.get("read", ()))
         return load_learning(self.path, failed) if is_there else fresh()

@@ -151,10 +151,8 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         self.given_horizon = None if horizon is None else positive("horizon", horizon)
         steps = None if horizon is None else max(1, round(horizon / self.dt))
         if steps is not None and steps > _MAX_STEPS:
-            raise ValueError(
-                f"horizon is {horizon:g} s, {steps:,} decisions of {dt:g} s; a learnt judge "
-                f"looks at most {_MAX_STEPS:,} ahead (is it in seconds?)"
-            )
+            most = f"a learnt judge looks at most {_MAX_STEPS:,} ahead (is it in seconds?)"
+            raise ValueError(f"horizon is {horizon:g} s, {steps:,} decisions of {dt:g} s; {most}")
         self.seed = operator.index(seed)
         self.model = function("model", model, "lambda z, u: z + 0.1 * u")
         self.backup = function("backup", backup, "lambda z: -1.0")
@@ -229,10 +227,8 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         right = Choices(self.choices) if self.choices else BoxActions(*box)
         ends = np.ravel(limits(right)), np.ravel(limits(actions))
         if isinstance(actions, Choices) != bool(self.choices) or not np.array_equal(*ends):
-            raise ValueError(
-                f"the judge was made for {right}, but the guard has {actions}: give it low and "
-                "high, or n_actions, of the guard"
-            )
+            fault = f"the judge was made for {right}, but the guard has {actions}"
+            raise ValueError(f"{fault}: give it low and high, or n_actions, of the guard")
 
     def encode(self, action: Any) -> Floats:
         """(a,) an action as it is learnt of: from -1 to 1, or 1 for the chosen one."""
