@@ -99,10 +99,8 @@ class Numbers(NamedTuple):
             return
         for number in (float(numbers.min()), float(numbers.max())):
             if not self.least <= number <= self.most:
-                ends = f"{self.least:g} and {self.most:g}"
-                raise ValueError(
-                    f"{name} of {number:g} cannot be right: it must lie between {ends}"
-                )
+                span = f"it must lie between {self.least:g} and {self.most:g}"
+                raise ValueError(f"{name} of {number:g} cannot be right: {span}")
         if self.whole and (isinstance(given, float) or (numbers != np.rint(numbers)).any()):
             raise ValueError(f"{name} holds a fraction; it must be an integer")
 

@@ -344,10 +344,9 @@ def run_configuration(
             cars.detach()  # else they guard what is simulated next
         if not cars.ever:
             types, ids = (", ".join(names[:9]) for names in (sorted({*kinds.values()}), [*kinds]))
-            raise ValueError(
-                f"--vehicles {vehicles}: it takes none of {len(kinds):,} cars in {seconds:,.0f} s, "
-                f"so nothing was guarded; a larger share takes more, types are {types}, ids {ids}"
-            )
+            fault = f"it takes none of {len(kinds):,} cars in {seconds:,.0f} s"
+            hint = f"a larger share takes more, types are {types}, ids {ids}"
+            raise ValueError(f"--vehicles {vehicles}: {fault}, so nothing was guarded; {hint}")
         if how == mode and by_ids and (absent := sorted({*choice} - cars.ever)):
             warn(f"--vehicles: never came: {', '.join(absent)}")
         return {"seconds": seconds, **cars.summary()}

@@ -159,11 +159,10 @@ def tables_of(model: FSMModel) -> Iterator[RenderableType]:
     stays = np.diag(model.changes) / np.maximum(model.changes.sum(axis=1), 1.0)
     heads = map(model.labels.variable, range(model.n_variables))
     centers = zip(*map(_aligned, model.centers.T), strict=True)
+    numbers = zip(centers, model.visits.tolist(), model.created.tolist(), strict=True)
     states = [
         (f"#{i + 1}", *center, f"{visits / total:.1%}", f"{stays[i]:.3f}", f"{row:,.0f}")
-        for i, (center, visits, row) in enumerate(
-            zip(centers, model.visits.tolist(), model.created.tolist(), strict=True)
-        )
+        for i, (center, visits, row) in enumerate(numbers)
     ]
     title = "States (time: while it learnt; stays: share of its steps; first seen: at which row)"
     most = sorted(np.argsort(-model.visits, kind="stable")[:_STATES_LISTED].tolist())
@@ -172,10 +171,8 @@ def tables_of(model: FSMModel) -> Iterator[RenderableType]:
     yield table(title, header, [states[k] for k in most])
     if (rest := model.n_states - len(most)) > 0:
         share = 1.0 - float(model.visits[most].sum()) / total
-        yield (
-            f"and {rest:,} more states, together {share:.1%} of the time (--json prints all, "
-            "evofsm explain says what came of one)"
-        )
+        hint = "--json prints all, evofsm explain says what came of one"
+        yield f"and {rest:,} more states, together {share:.1%} of the time ({hint})"
     yield ""
     transitions = passages(model)
     if not transitions:

@@ -260,10 +260,8 @@ class LatentRisk(Retraced, LearningJudge):
 
     def why(self, judged: Judgement) -> str:
         """Why the first action that was judged is dangerous, in a few words."""
-        return (
-            "could not survive a leader braking harder than "
-            f"{float(judged.critical[0]):.1f} m/s² (risk {float(judged.risk[0]):.1%})"
-        )
+        decel, risk = float(judged.critical[0]), float(judged.risk[0])
+        return f"could not survive a leader braking harder than {decel:.1f} m/s² (risk {risk:.1%})"
 
     def trial(self) -> Trial | None:
         """Full braking, until it is known what it brings."""
@@ -389,10 +387,8 @@ class LatentRisk(Retraced, LearningJudge):
             **{"TABLE": self.manoeuvres.table.shape[1], "harder": self.manoeuvres.table},
             **{"noise": self.perception.noise, "option_low": lowest, "option_high": highest},
         }
-        about = (
-            f"a decision: at most {len(lowest)} options times "
-            f"{rehearsal._HALVINGS + 2} rehearsals of 2 steps\n"
-        )
+        runs = f"{len(lowest)} options times {rehearsal._HALVINGS + 2} rehearsals of 2 steps"
+        about = f"a decision: at most {runs}\n"
         return Part(Path(__file__).with_suffix(".c"), 3, {"OPTIONS": len(lowest)}, constants, about)
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:

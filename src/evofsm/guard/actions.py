@@ -100,9 +100,8 @@ class BoxActions:
             raise ValueError(f"{counts}; an action has as many of both")
         for k, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
             if not low < high:
-                raise ValueError(
-                    f"low is {low:g} and high is {high:g} in component {k}; low must be below high"
-                )
+                ends = f"low is {low:g} and high is {high:g} in component {k}"
+                raise ValueError(f"{ends}; low must be below high")
 
     @cached_property
     def levels(self) -> tuple[int, ...]:

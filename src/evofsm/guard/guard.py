@@ -327,9 +327,8 @@ class Guard:
             judge = action_judge
         elif judge is None and hasattr(action_judge, "learn"):
             lacks = [name for name in _LEARNS if getattr(action_judge, name, None) is None]
-            raise ValueError(
-                f"the judge has a method learn, but not all of a LearningJudge: it lacks {lacks}"
-            )
+            fault = "the judge has a method learn, but not all of a LearningJudge"
+            raise ValueError(f"{fault}: it lacks {lacks}")
         for part, of in (("judge", judge), ("reviser", reviser)):
             dt = getattr(of, "dt", interval)
             if not math.isclose(dt, self.interval):
@@ -573,11 +572,9 @@ class Guard:
             return Intake.REPEATED if stands else Intake.LATE, z
         if self._stale == _STALE + 1:
             clock = "stands still: nothing is seen" if stands else "was set back, and goes on so"
-            warnings.warn(
-                f"times of {self._stale} observations on end were no later than {self._time:g} s, "
-                f"the time of the one before: the clock {clock}",
-                stacklevel=6,
-            )
+            last = f"{self._time:g} s, the time of the one before: the clock {clock}"
+            text = f"times of {self._stale} observations on end were no later than {last}"
+            warnings.warn(text, stacklevel=6)
         z = np.full(len(z), math.nan) if stands else z
         intake, latest_row = Intake.WHOLE, z
         if is_missing(z):
@@ -594,10 +591,9 @@ class Guard:
         is_number = type(time) is float or isinstance(time, SupportsFloat)  # asked quickly first
         seconds = float(time) if is_number else math.nan
         if not seconds < seconds + self.interval:  # nor is it of NaN, or infinite
-            raise ValueError(
-                f"time is {time!r}; it must be a number of seconds, finite and small enough to "
-                f"tell {self.interval:g} s apart: count from the start of the episode"
-            )
+            size = f"finite and small enough to tell {self.interval:g} s apart"
+            hint = f"it must be a number of seconds, {size}: count from the start of the episode"
+            raise ValueError(f"time is {time!r}; {hint}")
         return seconds
 
     def _checked(self, observation: ArrayLike) -> NDArray[np.float64]:

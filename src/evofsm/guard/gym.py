@@ -635,11 +635,9 @@ def _layers(env: Any) -> Iterator[Any]:
 def warn_of(env: Any, guard: Guard, failed: Failed | None) -> None:
     """Name what stands below a guard and keeps it from learning, or others from what it learns."""
     if guard.learn and guard.process != os.getpid():
-        warnings.warn(
-            "the guard was made in another process, and what it learns in this one stays here: run "
-            "the environments in one process (DummyVecEnv, SyncVectorEnv), or save it here",
-            stacklevel=3,
-        )
+        fault = "the guard was made in another process, and what it learns in this one stays here"
+        hint = "run the environments in one process (DummyVecEnv, SyncVectorEnv), or save it here"
+        warnings.warn(f"{fault}: {hint}", stacklevel=3)
     if failed is None and guard.failed is None and guard.learn:
         warnings.warn(
             "nobody says which episodes failed: all that are terminated are taken to have. If so, "
@@ -660,8 +658,6 @@ def warn_of(env: Any, guard: Guard, failed: Failed | None) -> None:
         elif name == "DelayObservation" and layer.delay > 1:
             why = "shows the guard where the system was, not where it is"
         if why:
-            warnings.warn(
-                f"{name} below the guard {why}: it learns badly, or nothing. Wrap the environment "
-                f"in the guard first, and that in {name}",
-                stacklevel=3,
-            )
+            hint = f"Wrap the environment in the guard first, and that in {name}"
+            fault = f"{name} below the guard {why}: it learns badly, or nothing"
+            warnings.warn(f"{fault}. {hint}", stacklevel=3)

@@ -160,12 +160,9 @@ class Harm(NamedTuple):
         ideal = well._replace(ended=self.ends or self._replaces_most)
         arms = [[*self.guarded, well], [*self.alone(), ideal]]
         random = np.random.default_rng([self.n_episodes, draws])
-        guarded, alone = (
-            random.gamma(
-                np.append(self._weights(arm[:-1], learning=True), hope), size=(draws, len(arm))
-            )
-            for arm, hope in zip(arms, (_HOPE, _HOPE_ALONE), strict=True)
-        )
+        hopes = zip(arms, (_HOPE, _HOPE_ALONE), strict=True)
+        weights = [np.append(self._weights(arm[:-1], learning=True), hope) for arm, hope in hopes]
+        guarded, alone = (random.gamma(shape, size=(draws, len(shape))) for shape in weights)
         won = np.einsum("ni,ij,nj->n", guarded, better(*arms), alone)
         return float((won >= 0.0).mean())
 

@@ -219,10 +219,9 @@ class FoxgloveSink(AbstractContextManager["FoxgloveSink"], DecisionLogger):
     def seen(self, observation: NDArray[np.float64], time: float) -> None:
         """An observation came in."""
         if len(observation) != len(self._names):
-            raise ValueError(
-                f"the sink is for {len(self._names)} variables ({', '.join(self._names)}), and an "
-                f"observation has {len(observation)}; give FoxgloveSink their names="
-            )
+            names = f"{len(self._names)} variables ({', '.join(self._names)})"
+            fault = f"the sink is for {names}, and an observation has {len(observation)}"
+            raise ValueError(f"{fault}; give FoxgloveSink their names=")
         self._time, self._observation = time, observation
         if not self._begun:
             self._begun = True

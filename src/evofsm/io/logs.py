@@ -628,10 +628,9 @@ def open_table(path: str, columns: LogColumns, skips: Skips) -> Table:
     kind = tables.file_kind(path)
     if kind == "bag" or (kind == "mcap" and columns.topics):  # whatever its profile says
         if columns.topics is None:
-            raise ValueError(
-                f"{path} is a bag of ROS 2; --topics names a file that says which field of which "
-                "topic is which variable (docs/how-to/logs-of-others.md has one)"
-            )
+            hint = "--topics names a file that says which field of which topic is which variable"
+            fault = f"{path} is a bag of ROS 2; {hint}"
+            raise ValueError(f"{fault} (docs/how-to/logs-of-others.md has one)")
         from evofsm.io.rosbag import BagTable
 
         return BagTable(path, columns.topics, columns.observe.names, skips)
@@ -667,11 +666,10 @@ def _columns_of_pairs(path: str, columns: LogColumns) -> LogColumns:
         options += [f"--failed {columns.failed} (but with 'gap<=0')"]
     options += ["--unit: write it in s, m and m/s"] * bool(columns.units)  # the last one
     if options:
-        raise ValueError(
-            f"{path} holds many vehicles (FCD of SUMO, objects, OSI), with a clock and episodes of "
-            f"their own; it gives {', '.join(VARIABLES)} and the action {ACTION}, and cannot be "
-            f"read with {', '.join(options)}"
-        )
+        kind = "many vehicles (FCD of SUMO, objects, OSI), with a clock and episodes of their own"
+        columns_there = f"{', '.join(VARIABLES)} and the action {ACTION}"
+        fault = f"it gives {columns_there}, and cannot be read with {', '.join(options)}"
+        raise ValueError(f"{path} holds {kind}; {fault}")
     return replace(columns, time="time", no_leader=None)
 
 

@@ -67,10 +67,9 @@ class Field(NamedTuple):
             steps += [step[1], *((int(p) if p.isdecimal() else p,) for p in places)]
             way = way[step.end() :]
         if way or not (steps and topic):
-            raise ValueError(
-                f"{text!r} is no field; write /topic.field, /topic.field.field, "
-                "/topic.field[0].field or, of what has a name in the message, /topic.field[name]"
-            )
+            ways = "/topic.field, /topic.field.field, /topic.field[0].field"
+            hint = f"{ways} or, of what has a name in the message, /topic.field[name]"
+            raise ValueError(f"{text!r} is no field; write {hint}")
         return cls(text, topic, tuple(steps))
 
     def read(self, message: Any, called: dict[int, str], count: int = 1) -> float | None:
@@ -96,9 +95,8 @@ class Field(NamedTuple):
                 owner, value = None, value[place]
             return float(value)
         except (AttributeError, TypeError, ValueError) as error:
-            raise RefusedError(
-                f"{self.text} is no number in message {count} of {self.topic!r}: {error}"
-            ) from None
+            where = f"message {count} of {self.topic!r}"
+            raise RefusedError(f"{self.text} is no number in {where}: {error}") from None
 
 
 def _names_in(owner: Any, array: Any) -> list[str]:
@@ -283,9 +281,8 @@ class BagTable(Table):
                 spans[topic] = [min(first, stamp), max(last, stamp), min(begin, at), max(end, at)]
                 stamp = at if self._topics.stamp == "header" else stamp
             elif self._topics.stamp == "header":
-                raise RefusedError(
-                    f'messages of {topic!r} ({kind.name}) have no header; write stamp = "received"'
-                )
+                fault = f"messages of {topic!r} ({kind.name}) have no header"
+                raise RefusedError(f'{fault}; write stamp = "received"')
             for field in fields:
                 if field.topic == topic:
                     stamps, numbers, names = values[field.text]

@@ -218,10 +218,9 @@ class Source(AbstractContextManager["Source"]):
         try:
             data: bytes = self._file.readline(most) if to_line_end else self._file.read1(most)
         except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-            message = (
-                f"{self.path}, after line {self.lines}: the gzip data ends early or is damaged "
-                f"(was a copy or a download interrupted, or is it still being written?): {error}"
-            )
+            cause = "was a copy or a download interrupted, or is it still being written?"
+            fault = f"the gzip data ends early or is damaged ({cause}): {error}"
+            message = f"{self.path}, after line {self.lines}: {fault}"
             if self._skips is None or not isinstance(error, EOFError):
                 raise ValueError(message) from error
             self._skips.leave_out("cut", message)

@@ -99,9 +99,8 @@ class PairTable(Table):
                 yield Piece(starts[-1], numbers, find, self.skips, starts=begins, names=names)
                 before, starts, blocks, names = before + starts[-1], [0], [], []
         if before == 0:
-            self.skips.refuse_nothing(
-                f"{self.path}: no vehicle ever follows another one on the same lane"
-            )
+            fault = "no vehicle ever follows another one on the same lane"
+            self.skips.refuse_nothing(f"{self.path}: {fault}")
 
     def _episodes(self) -> Iterator[tuple[_Pair, array[float] | None]]:
         """Rows of a pair for as long as it stays one, or until too many wait."""
@@ -117,11 +116,9 @@ class PairTable(Table):
             has_lanes = has_lanes or bool(cars)
             lanes = self._lanes(time, cars, headings)
             if not time > before:
-                self.skips.leave_out(
-                    "time",
-                    f"{where()}: time goes from {before:g} to {time:g}; it must run "
-                    "forward (rows not sorted by time, or two recordings in one file?)",
-                )
+                cause = "rows not sorted by time, or two recordings in one file?"
+                fault = f"time goes from {before:g} to {time:g}; it must run forward ({cause})"
+                self.skips.leave_out("time", f"{where()}: {fault}")
                 continue
             before = time
             present: dict[_Pair, array[float]] = {}

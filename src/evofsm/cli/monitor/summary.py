@@ -82,10 +82,9 @@ Answers = Iterable[tuple[Answer, Row | None]]
 def decided_on_log(decider: Decider, episodes: Iterable[Chunk]) -> Answers:
     """The answers to the rows of a log; with the last row of an episode it ends."""
     for episode in episodes:
-        *rows, last = (
-            tuple(None if math.isnan(value) else value for value in row)
-            for row in episode.observations.tolist()
-        )
+        values = episode.observations.astype(object)
+        values[np.isnan(episode.observations)] = None
+        *rows, last = map(tuple, values.tolist())
         for here, action, time in zip(rows, episode.actions.tolist(), episode.times, strict=False):
             row = Row(float(time), here, None if math.isnan(action) else action)
             yield decider.act(row), row

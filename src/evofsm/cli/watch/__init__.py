@@ -103,8 +103,7 @@ def _is_log(what: str) -> bool:
     if not place.exists():
         if place.suffix or len(place.parts) > 1:
             raise FileNotFoundError(2, "no such file or directory", what)
-        raise ValueError(
-            f"{what} is neither a file nor one of the families {', '.join(FAMILIES)}; an "
-            "environment of Gymnasium is named with its version: CartPole-v1"
-        )
+        fault = f"{what} is neither a file nor one of the families {', '.join(FAMILIES)}"
+        hint = "an environment of Gymnasium is named with its version: CartPole-v1"
+        raise ValueError(f"{fault}; {hint}")
     return place.suffix != ".py"

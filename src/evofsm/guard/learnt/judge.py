@@ -511,9 +511,8 @@ class LearntRisk(ObservingJudge, SearchingJudge):
             action = self.decode(inner)
             after = _answer("model", move, z, action if len(action) > 1 else action[0])
             if after.shape != (m,) or not np.isfinite(after).all():
-                raise ValueError(
-                    f"model gave {after} after {z} and {action}; it has to give {m} finite numbers"
-                )
+                fault = f"model gave {after} after {z} and {action}"
+                raise ValueError(f"{fault}; it has to give {m} finite numbers")
             return after
 
         def backup(z: Floats) -> Floats:

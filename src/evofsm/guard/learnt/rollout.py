@@ -101,10 +101,9 @@ def refuse_too_many(m: int, a: int, *, box: bool) -> None:
         most = (_MAX_FEATURES - n_features(1, 0, box=box)) // numbers
         raise ValueError(f"a learnt judge takes at most {most} {kind}, not {a}: group them")
     if m > most:
-        raise ValueError(
-            f"observation has {m} variables; with actions of {a} numbers a judge learns of at most "
-            f"{most}: choose those on which failure depends, as with observe= of RevisedActions"
-        )
+        fault = f"with actions of {a} numbers a judge learns of at most {most}"
+        hint = "choose those on which failure depends, as with observe= of RevisedActions"
+        raise ValueError(f"observation has {m} variables; {fault}: {hint}")
 
 
 def lags(m: int, a: int) -> Ints:

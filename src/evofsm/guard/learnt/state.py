@@ -401,9 +401,8 @@ def unpacked(arrays: Mapping[str, Any], blank: State) -> State:
     for name in _FIELDS:
         shape, rows = np.shape(getattr(state, name)), int(name != "squares")
         if shape[rows:] != np.shape(getattr(right, name))[rows:]:
-            raise ValueError(
-                f"{name} has shape {shape}, not one of {m} variables and actions of {a} numbers"
-            )
+            fault = f"not one of {m} variables and actions of {a} numbers"
+            raise ValueError(f"{name} has shape {shape}, {fault}")
     forms, steps = np.concatenate([state.forms, state.dropped]), state.windows.shape[1]
     indices = forms[:, [SAYS, I, J]]
     if ((indices != np.rint(indices)) | (indices < 0.0) | (indices >= [FATAL + 1, m, m])).any():
