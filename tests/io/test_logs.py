@@ -74,16 +74,6 @@ def pieces(request, monkeypatch):
 # -- What is read ---------------------------------------------------------------------------------
 
 
-def test_a_log_becomes_observations_actions_times_and_episodes(tmp_path):
-    path = write(tmp_path / "a.csv", [*log(3, "v1-v2"), *log(4, "v2-v3")])
-    (chunk,) = read(path)
-    assert chunk.observations.shape == (7, 3)
-    assert chunk.observations[1].tolist() == [1.5, 10.0, 11.0]
-    assert (chunk.actions == -0.25).all()
-    assert chunk.times.tolist() == [0.0, 0.1, 0.2, 0.0, 0.1, 0.2, 0.3]
-    assert (np.flatnonzero(chunk.begins).tolist(), chunk.dt, chunk.jumps) == ([0, 3], 0.1, 0)
-
-
 @pytest.mark.parametrize(
     "change",
     [
@@ -234,8 +224,6 @@ def test_episodes_that_come_back_are_refused_with_the_remedy(tmp_path, pieces):
 def test_what_is_no_table_is_refused(tmp_path, content, said):
     (tmp_path / "a.csv").write_bytes(content)
     assert said in refusal(str(tmp_path / "a.csv"))
-    with pytest.raises(IsADirectoryError, match="is a folder"):
-        read(str(tmp_path))
 
 
 def test_of_a_gzip_that_ends_early_the_beginning_is_read_and_a_damaged_one_refused(tmp_path):
