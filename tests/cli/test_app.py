@@ -77,7 +77,6 @@ def test_help_loads_nothing_heavy(command):
         (["drive", "paper", "--frozen", "nothing-here"], "nothing-here"),
         (["drive", "paper", "--tolerance", "2"], "tolerance"),
         (["drive", "paper", "--mcap", "a", "--workers", "2"], "workers send no decisions"),
-        (["paper", "--world", "kinematic", "--out", __file__], "file exists; name a folder"),
         (["drive", "paper", "--vehicles", "10%"], "--vehicles: only for a configuration"),
         (["drive", "paper", "--reviser", "none", "--mode", "act"], "--mode: only for --reviser l"),
     ],

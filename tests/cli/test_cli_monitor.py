@@ -127,13 +127,6 @@ def test_a_guard_that_began_beside_a_machine_is_given_to_another_monitor(tmp_pat
         assert told(result)[-1]["failed"] is True  # though --failed need not be typed again
 
 
-def test_in_csv_a_proposal_may_be_called_so():
-    names, row = b"time,gap,v_follower,v_leader,", b"0,100,20,20,-0.5"
-    answers = [told(evofsm(lines=(names + action, row))) for action in (b"a_follower", b"proposal")]
-    assert answers[0] == answers[1]
-    assert answers[0][-1]["proposed"] == -0.5
-
-
 def test_csv_with_a_column_twice_is_refused():
     names, row = b"time,gap,gap,v_follower,v_leader,a_follower", b"0,1,100,20,20,0"
     head, first = told(evofsm(lines=[names, row]))

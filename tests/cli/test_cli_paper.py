@@ -44,4 +44,5 @@ def test_a_claim_that_fails_is_shown_and_ends_with_1(evofsm, tmp_path, monkeypat
 def test_a_folder_that_cannot_be_is_said_before_anything_is_driven(refused, tmp_path, monkeypatch):
     monkeypatch.setattr("evofsm.paper.run_paper", None)
     (tmp_path / "file").write_text("in the way")
-    assert "file" in refused("paper", "--world", "kinematic", "--out", tmp_path / "file")
+    said = refused("paper", "--world", "kinematic", "--out", tmp_path / "file")
+    assert "file: file exists; name a folder" in said

@@ -150,10 +150,11 @@ def test_a_socket_serves_peers_that_come_vanish_and_send_junk(tmp_path, plain):
 def test_peers_name_their_columns_each_for_itself(tmp_path):
     path = tmp_path / "monitor.sock"
     with served(SocketTransport(path)), connected(path) as one, connected(path) as other:
-        for peer, names in (one, b"time,gap"), (other, b"gap,time"):
-            title = asked(peer, names + b",v_follower,v_leader,a_follower\n")
+        for peer, names in (one, b"time,gap,a_follower"), (other, b"gap,time,proposal"):
+            title = asked(peer, names + b",v_follower,v_leader\n")
             assert title["kind"] == "waiting"
-        assert asked(one, b"1,30,20,20,0\n")["time"] == asked(other, b"30,1,20,20,0\n")["time"] == 1
+        answers = asked(one, b"1,30,-0.5,20,20\n"), asked(other, b"30,1,-0.5,20,20\n")
+        assert [(one["time"], one["proposed"]) for one in answers] == [(1, -0.5)] * 2
         with connected(path) as nameless:
             assert asked(nameless, b"2,30,20,20,0\n")["kind"] == "error"
 
