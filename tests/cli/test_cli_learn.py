@@ -83,12 +83,9 @@ def test_options_reach_the_machine_and_the_log(evofsm, tmp_path):
     path, model = tmp_path / "log.csv", tmp_path / "model.evofsm"
     rows = [f"{k % 7},{'red' if k % 20 < 10 else 'green'},{k % 3}" for k in range(100)]
     path.write_text("\n".join(["x,light,u", *rows, ""]))
-    result = evofsm(
-        *("learn", path, "--observe", "x,light=red/green", "--action", "u", "--dt", "0.5"),
-        *("--action-range", "0:3:1", "--max-states", 9),
-        *("--episode", "", "--out", model),
-    )
-    assert result.exit_code == 0
+    asked = "learn", path, "--observe", "x,light=red/green", "--action", "u", "--dt", "0.5"
+    asked += "--action-range", "0:3:1", "--max-states", 9, "--episode", "", "--out", model
+    assert evofsm(*asked).exit_code == 0
     learnt = FSMModel.load(model)
     assert learnt.names == ("x", "light=red", "light=green")
     assert learnt.n_actions == 3
