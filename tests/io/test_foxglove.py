@@ -51,12 +51,6 @@ def messages(path):
     return found
 
 
-def schemas(path):
-    with open(path, "rb") as file:
-        summary = make_reader(file).get_summary()
-    return {c.topic: summary.schemas[c.schema_id] for c in summary.channels.values()}
-
-
 # -- Files ----------------------------------------------------------------------------------------
 
 
@@ -92,8 +86,10 @@ def test_another_reader_finds_every_decision_and_what_happened_in_the_order_of_t
 
 
 def test_schemas_are_such_as_foxglove_takes_and_name_what_the_messages_hold(driven):
-    _, log = driven
-    found, sent = schemas(log), messages(log)
+    sent = messages(driven[1])
+    with open(driven[1], "rb") as file:
+        summary = make_reader(file).get_summary()
+    found = {c.topic: summary.schemas[c.schema_id] for c in summary.channels.values()}
     assert found.pop("/log").name == "foxglove.Log"
     kinds = {"number": (float, int), "integer": int, "string": str, "array": list, "object": dict}
     for topic, schema in found.items():

@@ -38,8 +38,7 @@ def short(gaps, pair="p", crash=None):
 
 
 def write(path, lines, header=HEADER):
-    text = "\n".join([header, *lines, ""]).encode()
-    path.write_bytes(gzip.compress(text) if path.suffix == ".gz" else text)
+    path.write_text("\n".join([header, *lines, ""]))
     return str(path)
 
 
@@ -50,11 +49,9 @@ def read(*paths, noted=None, **columns):
 def together(*paths, noted=None, **columns):
     """Of all chunks as one: gaps, starts, failures."""
     chunks = read(*paths, noted=noted, **columns)
-    gaps = np.concatenate([chunk.observations[:, 0] for chunk in chunks])
-    begins, fails = (
-        np.concatenate(x) for x in zip(*((c.begins, c.fails) for c in chunks), strict=True)
-    )
-    return gaps.tolist(), *(np.flatnonzero(x).tolist() for x in (begins, fails))
+    of_each = ((chunk.observations[:, 0], chunk.begins, chunk.fails) for chunk in chunks)
+    gaps, *marks = map(np.concatenate, zip(*of_each, strict=True))
+    return gaps.tolist(), *(np.flatnonzero(x).tolist() for x in marks)
 
 
 def refusal(*paths, **columns):
@@ -545,10 +542,7 @@ def taken(tmp_path, rows, noted=None, **columns):
     path = write(tmp_path / "a.csv", lines, "time;x;u;Status")
     settings = {"observe": ObservationEncoder("x"), "action": "u", **columns}
     return [
-        (
-            *(one.tolist() for one in (e.times, e.observations[:, 0], e.actions)),
-            np.flatnonzero(e.fails).tolist(),
-        )
+        tuple(x.tolist() for x in (e.times, e.observations[:, 0], e.actions, e.fails.nonzero()[0]))
         for e in episodes_of(read(path, noted=noted, **settings))
     ]
 
@@ -601,9 +595,7 @@ STOPS = ["0 1 1 on", "1 2 9 on", "2 3 9 on", "3 4 0 on", "4 5 0 off", "5 6 9 on"
 def test_rows_that_are_not_chosen_end_an_episode_in_failure_if_it_begins_with_them(
     tmp_path, pieces, status, failures
 ):
-    rows = [
-        f"{row.rpartition(' ')[0]} {one}" for row, one in zip(STOPS, status.split(), strict=True)
-    ]
+    rows = [f"{row[:5]} {one}" for row, one in zip(STOPS, status.split(), strict=True)]
     noted = Noted()
     found = taken(tmp_path, rows, noted, where="u>5", failed="Status==off")
     assert [values for _, values, *_ in found] == [[2, 3], [6, 7]]

@@ -341,11 +341,9 @@ def test_a_name_that_is_used_again_at_once_begins_an_episode(tmp_path):
 
 
 def test_who_stands_points_where_it_moved_last_or_where_it_is_said_to(tmp_path):
-    rows = [
-        row
-        for t, v in ((0.0, 1.0), (0.1, 0.0), (0.2, 0.0))
-        for row in [("b", t, 0, 0, -v, 0, 4, 1), ("a", t, -20, 0, 0, 0, 4, 1)]
-    ]
+    rows = []
+    for t, v in ((0.0, 1.0), (0.1, 0.0), (0.2, 0.0)):
+        rows += [("b", t, 0, 0, -v, 0, 4, 1), ("a", t, -20, 0, 0, 0, 4, 1)]
     ((observations, _, _),) = episodes(objects(tmp_path / "a.csv", rows))
     assert observations[:, 0].tolist() == [16.0, 16.0, 16.0]
     told = [(*row[:4], 0, 0, *row[6:], math.pi) for row in rows]
@@ -429,8 +427,9 @@ def test_in_osi_one_on_several_lanes_leads_on_each_and_a_trailer_follows_nobody(
     assert gaps == {"1 behind 2": 16.0, "2 behind 3": 22.0}
 
 
+NO_INDEX = {"index_types": IndexType.NONE, "use_statistics": False, "use_summary_offsets": False}
 LEFT_OPEN = {
-    "without an index": {"index_types": 0, "use_statistics": False, "use_summary_offsets": False},
+    "without an index": NO_INDEX,
     "a lean summary": {"repeat_schemas": False, "repeat_channels": False},
     "without chunks": {"use_chunking": False},
 }
@@ -439,13 +438,11 @@ LEFT_OPEN = {
 @pytest.mark.parametrize("how", LEFT_OPEN.values(), ids=LEFT_OPEN.keys())
 def test_what_mcap_leaves_open_may_be_left_out_or_there(tmp_path, how):
     path = tmp_path / "trace.mcap"
-    if "index_types" in how:
-        how = how | {"index_types": IndexType.NONE}
     path.write_bytes(whole := osi_mcap(enable_data_crcs=False, **how))
     assert_pair(path)
     unknown = b"\x99" + (3).to_bytes(8, "little") + b"own"
     path.write_bytes(whole[:8] + unknown + whole[8:])
-    if "index_types" in how:  # no place is told that would have moved
+    if how is NO_INDEX:  # no place is told that would have moved
         assert_pair(path)
     for end in (len(whole) - 8, len(whole) - 60):
         path.write_bytes(whole[:end])

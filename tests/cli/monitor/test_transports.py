@@ -100,7 +100,7 @@ def test_what_waits_for_its_slot_is_decided_on_where_nothing_comes_and_rows_afte
     reader, writer = (os.fdopen(end, mode, 0) for end, mode in ((source, "rb"), (sink, "wb")))
     server = Server(decider)
     thread = threading.Thread(target=server.run, args=(Stream(reader, writer),))
-    with os.fdopen(drain) as answers, unittest.mock.patch("signal.signal"):
+    with os.fdopen(drain) as answers, reader, writer, unittest.mock.patch("signal.signal"):
         thread.start()
         os.write(feed, b"".join(ROWS[:4]))  # of 0.0 to 0.3 s
         kinds = [json.loads(answers.readline())["kind"] for _ in range(4)]
@@ -114,8 +114,6 @@ def test_what_waits_for_its_slot_is_decided_on_where_nothing_comes_and_rows_afte
         os.close(feed)
         assert json.loads(answers.readline())["n"] == 3  # as the input ends
         thread.join(PATIENCE)
-    reader.close()
-    writer.close()
 
 
 def connected(path):
@@ -170,9 +168,8 @@ def test_a_peer_that_does_not_read_holds_up_no_other(tmp_path):
 
 def test_a_socket_that_was_left_is_replaced_one_that_is_used_is_not(tmp_path):
     path = tmp_path / "monitor.sock"
-    left = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    left.bind(os.fspath(path))
-    left.close()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as left:
+        left.bind(os.fspath(path))
     transport = SocketTransport(path)
     with pytest.raises(ValueError, match="another process listens there"):
         SocketTransport(path)
