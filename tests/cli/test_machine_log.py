@@ -17,12 +17,14 @@ from evofsm import Guard
 from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.monitor.slots import Slots
 from evofsm.cli.monitor.summary import decided_on_log
-from evofsm.cli.options import reading_of
+from evofsm.cli.options import read_with, reading_of
 from evofsm.cli.watch.session import watched_log
 from evofsm.cli.watch.words import introduce, tell
 from evofsm.io import LogColumns, episodes_of, read_traces
 
 VIBRATION, BEARING = "Schwingung, mm/s", "Lagertemperatur °C"
+RUNS = "--where", "Drehzahl>100", "--failed", "Status==Störung"
+BOTH = "--observe", f'"{VIBRATION}",{BEARING}', "--action", "", "--hole", "5min", *RUNS
 
 
 @pytest.fixture(autouse=True)
@@ -131,8 +133,7 @@ def test_a_guard_s_file_knows_how_its_log_is_read(evofsm, refused, written):
     told = evofsm(*asked)
     assert "is the time in" not in told.stderr  # which is a date
     assert "(a longer --hole bridges them)" in " ".join(told.stdout.split())
-    needs = "--where", "Drehzahl>100", "--failed", "Status==Störung"
-    told = evofsm(*asked, *needs, "--resample", "30s", "--guard", "guard.evofsm")
+    told = evofsm(*asked, *RUNS, "--resample", "30s", "--guard", "guard.evofsm")
     assert told.stderr == ""
     of_guard = "monitor", path, "--summary", "--guard", "guard.evofsm"
     assert "nobody acts" in refused("export", of_guard[-1], "--to", "c99", "--out", "c")
@@ -140,7 +141,7 @@ def test_a_guard_s_file_knows_how_its_log_is_read(evofsm, refused, written):
     assert (as_learnt.exit_code, as_learnt.stderr) == (0, "")
     stated = {row["stated"]: row["is_own"] for row in json.loads(as_learnt.stdout)["alarms"]}
     assert stated == {0.1: False, 0.3: False, 1.0: True, 3.0: False}
-    by_half = "--summary", "--observe", f'"{VIBRATION}"', *asked[4:], *needs, "--resample", "30s"
+    by_half = "--summary", "--observe", f'"{VIBRATION}"', *asked[4:], *RUNS, "--resample", "30s"
     assert "the last 5" in evofsm("monitor", path, *by_half, "--split", 0.5).stdout
     other = evofsm(*of_guard, "--resample", "1min")
     assert "a row every 60 s, and guard.evofsm decides each 30 s: --resample 30s" in other.stderr
@@ -388,9 +389,8 @@ def seconds(date):
 
 @pytest.mark.slow
 def test_rows_that_come_live_become_what_they_were_in_the_log(evofsm, written, pump):
-    path, of, how = written("parquet"), f'"{VIBRATION}",{BEARING}', f"20s,{BEARING}=last"
-    asked = "--observe", of, "--action", "", "--time", "Zeit", "--resample", how, "--hole", "5min"
-    asked = *asked, "--where", "Drehzahl>100", "--failed", "Status==Störung", "--rule", "novelty"
+    path, asked = written("parquet"), (*BOTH, "--time", "Zeit", "--rule", "novelty")
+    asked += "--resample", f"20s,{BEARING}=last"
     scales = "--scale", f"{VIBRATION}=1", "--scale", f"{BEARING}=2"
     assert evofsm("learn", path, *asked, *scales, "--guard", "guard.evofsm").exit_code == 0
     log = pump()
@@ -403,7 +403,7 @@ def test_rows_that_come_live_become_what_they_were_in_the_log(evofsm, written, p
     found = [a.get("last", a) if a.get("failed", True) else a for a in answers]
     found = [one for one in found if one["kind"] == "decision"]
     # As the log is read: by the options that are in the guard's file.
-    told = json.loads(evofsm("inspect", "guard.evofsm", "--json").stdout)["provenance"]["read with"]
+    told = read_with(Path("guard.evofsm"))
     chunks = read_traces([path], reading_of(**told))
     decider = Decider(Guard.load("guard.evofsm"), slots=Slots(LogColumns(hole=300.0)))
     expected = [a for a, row in decided_on_log(decider, episodes_of(chunks)) if row is not None]
@@ -427,13 +427,10 @@ def test_rows_that_come_live_become_what_they_were_in_the_log(evofsm, written, p
 
 @pytest.mark.slow
 def test_a_guard_from_zero_where_nobody_acts_learns_as_it_goes(evofsm, pump):
-    log, of = pump(18), f'"{VIBRATION}",{BEARING}'
-    asked = "--observe", of, "--action", "", "--resample", "20s", "--hole", "5min"
-    asked = *asked, "--where", "Drehzahl>100", "--failed", "Status==Störung"
-    alarmed = []
+    log, alarmed = pump(18), []
     for part in (log[: len(log) // 2], log[len(log) // 2 :]):  # the second one goes on
         rows = sent(part, "rows.jsonl")
-        done = evofsm("monitor", rows, *asked, "--state", "pump.evofsm")
+        done = evofsm("monitor", rows, *BOTH, "--resample", "20s", "--state", "pump.evofsm")
         assert done.exit_code == 0, done.stderr
         for said in (f"a guard of {VIBRATION}, {BEARING} learns", "ready: reads rows.jsonl"):
             assert said in done.stderr
@@ -478,11 +475,9 @@ def test_a_guard_from_zero_of_who_acts_learns_what_fails(evofsm, acts):
 
 
 def test_a_log_of_any_machine_is_watched(evofsm, written):
-    asked = {"time": "Zeit", "resample": "20s", "hole": "5min", "failed": "Status==Störung"}
-    asked |= {"observe": f'"{VIBRATION}",{BEARING}', "where": "Drehzahl>100", "action": ""}
-    path, reading = written("parquet"), reading_of(**asked)
-    words = [word for name, value in asked.items() for word in (f"--{name}", value)]
-    assert evofsm("learn", path, *words, "--guard", "guard.evofsm").exit_code == 0
+    path, asked = written("parquet"), (*BOTH, "--time", "Zeit", "--resample", "20s")
+    assert evofsm("learn", path, *asked, "--guard", "guard.evofsm").exit_code == 0
+    reading = reading_of(**read_with(Path("guard.evofsm")))
     with watched_log(path, reading, guard=Guard.load("guard.evofsm")) as shown:
         first, second, *_, last = shown.start.cases
         assert first == "episode 1, 2025-03-10 06:00:20 (alarm, failure)"
