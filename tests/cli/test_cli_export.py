@@ -105,7 +105,6 @@ def test_no_text_from_a_file_tells_the_terminal_what_to_do(evofsm, tmp_path):
     evil = "\x1b[2Jgap\x9b31m\r\u202e"
     model = machine.model(names=[evil], units=[evil], dt=0.1)
     model.save(tmp_path / "model", {evil: evil, "files": [{"name": evil, "bytes": 1}]})
-    (tmp_path / "text").write_text("x")
     printed = [
         *(("inspect", tmp_path / "model"), ("inspect", tmp_path / "model", "--json")),
         ("explain", tmp_path / "model", "--state", "all"),

@@ -4,7 +4,7 @@ import json
 import math
 import socket
 import time
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from http.client import HTTPConnection
 from urllib.parse import urlsplit
 
@@ -33,19 +33,12 @@ def session():
         yield opened
 
 
-def get(page, path, host=None, **headers):
+def get(page, path, host=None):
     """Status, headers and body of a request."""
-    connection = HTTPConnection("127.0.0.1", page.port, timeout=60)
-    try:
-        connection.putrequest("GET", path, skip_host=True)
-        connection.putheader("Host", host or f"127.0.0.1:{page.port}")
-        for name, value in headers.items():
-            connection.putheader(name, value)
-        connection.endheaders()
+    with closing(HTTPConnection("127.0.0.1", page.port, timeout=60)) as connection:
+        connection.request("GET", path, headers={"Host": host or f"127.0.0.1:{page.port}"})
         answer = connection.getresponse()
         return answer.status, dict(answer.getheaders()), answer.read()
-    finally:
-        connection.close()
 
 
 def looking_on(page, *, origin=None, token=None, sock=None, host=None):

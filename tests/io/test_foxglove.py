@@ -1,6 +1,5 @@
 """Decisions as MCAP, and live: what Foxglove's library writes and sends."""
 
-import io
 import json
 import math
 import re
@@ -8,7 +7,7 @@ import struct
 import time
 import tracemalloc
 from contextlib import suppress
-from types import SimpleNamespace
+from itertools import chain, compress
 
 import pytest
 from mcap.reader import make_reader
@@ -73,14 +72,9 @@ def test_another_reader_finds_every_decision_and_what_happened_in_the_order_of_t
     assert times[-1] - events[5][0] == round(decisions[-1].situation.time * 1e9)
     entries = [data.decode(errors="ignore") for _, data in found["/log"]]
     warnings = [entry for entry in entries if ", executed" in entry]
-    changed = [
-        decision.revision.reason
-        for episode in episodes
-        for decision, change in zip(episode.decisions, episode.changed, strict=True)
-        if change
-    ]
-    for warning, reason in zip(warnings, changed, strict=True):
-        assert f"m/s²: {reason}" in warning
+    changed = compress(decisions, chain(*(episode.changed for episode in episodes)))
+    for warning, decision in zip(warnings, changed, strict=True):
+        assert f"m/s²: {decision.revision.reason}" in warning
     assert any("would advise" in entry for entry in entries)
     assert sum("collision" in entry and "m/s" not in entry for entry in entries) == 1
 
@@ -112,13 +106,9 @@ def test_what_is_not_known_is_left_out(tmp_path):
     assert "time_headway" not in found["/risk"][1][1]  # it stands
 
 
-def test_a_full_disk_is_told(monkeypatch):
-    full = SimpleNamespace(
-        BufferedWriter=io.BufferedWriter, FileIO=lambda *_: io.FileIO("/dev/full", "w")
-    )
-    monkeypatch.setattr("evofsm.io.foxglove.io", full)
-    guard = guard_for_cars(low=-4.0, high=2.5)
-    with pytest.raises(OSError, match="No space"), FoxgloveSink(None, "any") as guard.audit:
+def test_a_full_disk_is_told(tmp_path, full_at):
+    guard, path = guard_for_cars(low=-4.0, high=2.5), tmp_path / "run.mcap"
+    with full_at(1), pytest.raises(OSError, match="large"), FoxgloveSink(None, path) as guard.audit:
         drive(guard, Scenario(LEADER, 8.0, duration=60.0), controller=HASTY)
 
 

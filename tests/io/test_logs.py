@@ -134,11 +134,9 @@ def test_any_table_is_read_as_python_s_own_reader_reads_it(
     writer.writerows([["x", "a text", "y"], *rows])
     path = tmp_path_factory.getbasetemp() / "any.csv"
     path.write_bytes(file.getvalue().encode())
-    usual, tables._CSV_BYTES = tables._CSV_BYTES, size
-    try:
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(tables, "_CSV_BYTES", size)
         pieces = list(CsvTable(str(path)).pieces(Wanted(["y", "x"], ["a text"])))
-    finally:
-        tables._CSV_BYTES = usual
     wanted = list(csv.reader(io.StringIO(file.getvalue(), newline=""), delimiter=separator))
     wanted = [row for row in wanted if row][1:]
     for place, name in ((0, "x"), (2, "y")):

@@ -250,6 +250,10 @@ def test_a_judge_that_raises_is_answered_and_gone_on_after(monkeypatch):
     assert decider.answer(third)["kind"] == "decision"
 
 
+def full(*_, **__):
+    raise OSError(28, "No space left on device")
+
+
 @pytest.mark.parametrize(("is_removed", "logged"), [(False, 40), (True, 30)])
 def test_without_an_audit_log_decisions_go_on_and_are_logged_again_when_they_can_be(
     tmp_path, monkeypatch, is_removed, logged
@@ -257,10 +261,6 @@ def test_without_an_audit_log_decisions_go_on_and_are_logged_again_when_they_can
     guard = made()
     guard.audit = log = AuditLog(tmp_path / "audit.jsonl")
     decider, plain = Decider(guard), Decider(made())
-
-    def full(_):
-        raise OSError(28, "No space left on device")
-
     for k, row in enumerate(rows(60)):
         if k == 20 and is_removed:
             log.path.unlink()

@@ -2,7 +2,7 @@ from contextlib import suppress
 
 import msgspec
 import pytest
-from tests.cli.monitor.test_decider import made
+from tests.cli.monitor.test_decider import full, made
 
 from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.monitor.slots import Slots
@@ -207,10 +207,6 @@ def test_two_monitors_do_not_keep_themselves_in_one_place(tmp_path, opened):
 
 def test_where_it_can_not_be_kept_it_goes_on_says_so_and_keeps_it_later(opened, monkeypatch):
     decider, state = opened()
-
-    def full(*_, **__):
-        raise OSError(28, "No space left on device")
-
     rows = [line(row) for row in traffic(9)]
     with monkeypatch.context() as patched:
         for keeper, name in ((state._journal, "append"), (decider.guard, "save")):
