@@ -4,7 +4,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from contextlib import closing
 from pathlib import Path
@@ -12,6 +11,7 @@ from types import SimpleNamespace
 
 import polars
 import pytest
+from tests.cli.test_cli_monitor import started
 
 from evofsm import Guard
 from evofsm.cli.driving import (
@@ -27,11 +27,6 @@ from evofsm.guard.audit_log import digests_of
 
 EMERGENCY = load_family("emergency")
 EPISODES = 400
-
-
-def started(*words, **how):
-    command = [sys.executable, "-m", "evofsm", "drive", *map(str, words)]
-    return subprocess.Popen(command, stderr=subprocess.PIPE, **how)
 
 
 def begun(folder, setup):
@@ -232,14 +227,14 @@ def test_it_is_what_driving_in_turn_makes_of_the_same_episodes(tmp_path, world):
 @pytest.mark.slow
 def test_killed_workers_and_a_killed_parent_change_nothing(evofsm, tmp_path):
     journal, words = tmp_path / "episodes.jsonl", unrevised(tmp_path, "--workers", 2)
-    with started(*words, stdout=subprocess.DEVNULL) as process:
+    with started("drive", *words, stdout=subprocess.DEVNULL) as process:
         wait_for(journal, 2, process)
         os.kill(workers_of(process)[0], signal.SIGKILL)
         assert process.wait() == 2
         assert b"a worker died (out of memory?" in process.stderr.read()
     done = lines(journal)
     assert done <= EPISODES
-    with started(*words, stdout=subprocess.DEVNULL) as process:
+    with started("drive", *words, stdout=subprocess.DEVNULL) as process:
         wait_for(journal, done + 60, process)
         workers = workers_of(process)
         process.kill()
@@ -261,7 +256,7 @@ def test_killed_workers_and_a_killed_parent_change_nothing(evofsm, tmp_path):
 @pytest.mark.slow
 def test_an_interruption_is_quiet_and_says_how_to_go_on(tmp_path):
     words = unrevised(tmp_path, "--workers", 2, "--episodes", 10_000)
-    with started(*words, text=True, start_new_session=True) as process:
+    with started("drive", *words, text=True, start_new_session=True) as process:
         wait_for(tmp_path / "episodes.jsonl", 2, process)
         os.killpg(process.pid, signal.SIGINT)
         said = process.stderr.read()

@@ -40,7 +40,7 @@ def expected(rows=ROWS, **settings):
 
 
 def started(*arguments, **pipes):
-    command = [sys.executable, "-m", "evofsm", "monitor", *map(str, arguments)]
+    command = [sys.executable, "-m", "evofsm", *map(str, arguments)]
     given = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE) | pipes
     return subprocess.Popen(command, **given)
 
@@ -125,13 +125,6 @@ def test_a_guard_that_began_beside_a_machine_is_given_to_another_monitor(tmp_pat
         result = evofsm("--guard", state, *options, lines=rows)
         assert result.exit_code == 0, result.stderr
         assert told(result)[-1]["failed"] is True  # though --failed need not be typed again
-
-
-def test_csv_with_a_column_twice_is_refused():
-    names, row = b"time,gap,gap,v_follower,v_leader,a_follower", b"0,1,100,20,20,0"
-    head, first = told(evofsm(lines=[names, row]))
-    assert (head["about"], first["about"], first["kind"]) == ("gap", "line", "error")
-    assert "gap is the name of several columns" in first["error"]
 
 
 @pytest.mark.parametrize("goes_on", [False, True])
@@ -284,7 +277,7 @@ def test_however_it_ends_it_goes_on_bit_for_bit(tmp_path):
     by_hand, answers = expected(rows), []
     for part, name in enumerate(("SIGKILL", "SIGTERM", "SIGINT")):
         number = getattr(signal, name)
-        with started("--learn", "--state", tmp_path / "state.evofsm") as process:
+        with started("monitor", "--learn", "--state", tmp_path / "state.evofsm") as process:
             for row in rows[30 * part : 30 * part + 30]:
                 assert asked(process, JUNK[1])["kind"] == "error"
                 answers.append(asked(process, row))
@@ -306,7 +299,7 @@ def test_streams_that_are_closed_or_do_not_wait_end_it_in_a_line_or_not_at_all()
     done = subprocess.run(f"{base} 2>&-", shell=True, capture_output=True, input=ROWS[0])
     assert (done.returncode, done.stdout.count(b"\n"), done.stdout[:1]) == (0, 1, b"{")
     (source, feed), (drain, sink) = os.pipe(), os.pipe()
-    with started(stdin=source, stdout=sink) as process:
+    with started("monitor", stdin=source, stdout=sink) as process:
         os.write(feed, ROWS[0] + b"\n")
         out = os.read(drain, 1 << 16)
         for shared in (source, sink):  # as who shares them with it may do at any time
@@ -327,7 +320,7 @@ def test_streams_that_are_closed_or_do_not_wait_end_it_in_a_line_or_not_at_all()
 @posix
 @pytest.mark.slow
 def test_a_reader_that_vanishes_ends_it_in_a_line():
-    with started() as process:
+    with started("monitor") as process:
         asked(process, ROWS[0])
         process.stdout.close()
         process.stdin.write(ROWS[1] + b"\n")
@@ -344,7 +337,7 @@ def test_a_client_in_c_gets_its_alarm_by_a_socket(tmp_path):
     if shutil.which(compiler[0]) is None:
         pytest.skip("there is no such compiler")
     path, client = tmp_path / "monitor.sock", tmp_path / "client"
-    with started("--warm", "--socket", path) as process:
+    with started("monitor", "--warm", "--socket", path) as process:
         next(one for one in iter(process.stderr.readline, b"") if b"listens" in one)
         flags = "-std=c99", "-D_POSIX_C_SOURCE=200809L", "-Wall", "-Wextra", "-Werror"
         subprocess.run([*compiler, *flags, "-o", client, EXAMPLES / "client.c"], check=True)

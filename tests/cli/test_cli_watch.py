@@ -1,9 +1,8 @@
 import signal
-import subprocess
-import sys
 from urllib.request import urlopen
 
 import pytest
+from tests.cli.test_cli_monitor import started
 
 from evofsm import EvolvingFSM
 
@@ -19,9 +18,8 @@ LOG = ["time,gap,v_follower,v_leader,a_follower", *(f"{k / 10},30,20,20,0" for k
 )
 def test_it_prints_an_address_that_answers_and_ends_with_control_c(tmp_path, arguments, may):
     (tmp_path / "log.csv").write_text("\n".join([*LOG, ""]))
-    command = [sys.executable, "-m", "evofsm", "watch", *arguments, "--no-browser"]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    with subprocess.Popen(command, cwd=tmp_path, **pipes) as process:
+    words = "watch", *arguments, "--no-browser"
+    with started(*words, cwd=tmp_path, text=True) as process:
         try:
             said = process.stdout.readline()
             with urlopen(process.stdout.readline().strip(), timeout=60) as answer:

@@ -340,6 +340,9 @@ def test_live_rows_stand_as_in_the_log_and_what_cannot_be_compared_is_refused(ev
     first, *others = (a["error"] for a in answers("zeit;trip;heat;runs", *lines))
     assert [a["kind"] for a in answers(*lines)] == ["error"] * len(others) == ["error"] * len(lines)
     assert "is no column; there are zeit, trip, heat, runs (zeit? case counts)" in first
+    twice, row, *_ = answers("Zeit;trip;heat;heat;runs", *lines)
+    assert (twice["about"], row["about"], row["kind"]) == ("heat", "line", "error")
+    assert "heat is the name of several columns" in row["error"]
     faults = {
         "'1'; it is compared with the number 1.0 (--failed)": {"trip": "1"},
         "'TRIP'; it must be a truth value": {"runs": "TRIP"},

@@ -154,13 +154,12 @@ def test_whoever_connects_sees_the_decisions_as_they_are_made():
     with FoxgloveSink(0) as sink:
         guard.audit = sink
         with connect(sink.address, subprotocols=["foxglove.sdk.v1"], proxy=None) as client:
-            channel = None
-            while channel is None:
-                told = json.loads(client.recv(timeout=60))
-                for one in told.get("channels", []):
-                    channel = one["id"] if one["topic"] == "/decision" else channel
-            asked = {"op": "subscribe", "subscriptions": [{"id": 7, "channelId": channel}]}
-            client.send(json.dumps(asked))
+            found = {}
+            while "/decision" not in found:
+                channels = json.loads(client.recv(timeout=60)).get("channels", [])
+                found |= {one["topic"]: one["id"] for one in channels}
+            asked = {"id": 7, "channelId": found["/decision"]}
+            client.send(json.dumps({"op": "subscribe", "subscriptions": [asked]}))
             data, tries = "", 0
             while not isinstance(data, bytes):  # until the server has heard that somebody listens
                 tries += 1

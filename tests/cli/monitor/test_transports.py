@@ -125,10 +125,8 @@ def connected(path):
 
 def asked(peer, row):
     peer.sendall(row)
-    data = b""
-    while not data.endswith(b"\n"):
-        data += peer.recv(1 << 16)
-    return json.loads(data)
+    with peer.makefile("rb") as answers:
+        return json.loads(answers.readline())
 
 
 def test_a_socket_serves_peers_that_come_vanish_and_send_junk(tmp_path, plain):
