@@ -4,6 +4,7 @@ import json
 import math
 import random
 import re
+from unittest.mock import Mock
 
 import pytest
 from tests.test_recipes import write
@@ -270,10 +271,7 @@ def test_files_that_are_none_end_with_one_line(evofsm, refused, log, tmp_path):
 
 
 def test_ctrl_c_says_so_and_saves_nothing(evofsm, log, tmp_path, monkeypatch):
-    def interrupted(*arguments):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("evofsm.io.logs._Reader.chunks", interrupted)
+    monkeypatch.setattr("evofsm.io.logs._Reader.chunks", Mock(side_effect=KeyboardInterrupt))
     result = evofsm("learn", log, "--out", tmp_path / "model")
     assert result.exit_code == 130
     assert "stopped before the end" in result.stderr

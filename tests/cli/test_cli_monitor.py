@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.cli.monitor.test_decider import answers_to
 from typer.testing import CliRunner
 
 from evofsm.cli import application
@@ -31,12 +32,8 @@ def evofsm(*arguments, lines=()):
 
 
 def told(result):
+    assert result.exit_code == 0, result.stderr
     return [json.loads(one) for one in result.stdout.splitlines()]
-
-
-def expected(rows=ROWS, **settings):
-    decider = Decider(guard_of_monitor(0.1, 6.0), **settings)
-    return [decider.answer(row) for row in rows]
 
 
 def started(*arguments, **pipes):
@@ -62,19 +59,15 @@ def ended(process):
 def test_rows_from_a_file_and_from_standard_input_are_answered_alike(tmp_path):
     file = tmp_path / "rows.jsonl"
     file.write_bytes(b"\n".join(ROWS))
-    frozen = guard_of_monitor(0.1, 6.0)
-    frozen.learn = False
-    decider = Decider(frozen)
-    by_hand = [decider.answer(row) for row in ROWS]
+    by_hand = answers_to(ROWS, learn=False)
     for result in (evofsm(file), evofsm(lines=ROWS), evofsm("--warm", lines=ROWS)):
-        assert result.exit_code == 0, result.stderr
         assert told(result) == by_hand
     assert "compiled" in result.stderr
 
 
 def test_a_state_goes_on_over_runs_and_may_be_the_guards_own_file(tmp_path):
     rows = [line(row) for row in traffic(200)]
-    by_hand = expected(rows)
+    by_hand = answers_to(rows)
     state = tmp_path / "state.evofsm"
     guard_of_monitor(0.1, 6.0).save(state)
     options = ("--learn", "--guard", state, "--state", state)
@@ -104,7 +97,6 @@ def test_a_file_is_taken_in_once_and_as_it_grows_what_is_new_of_it(tmp_path):
         file.write_text("\n".join([names, *lines, half]))
         result = evofsm(file, "--learn", "--state", state)
         assert ("no line end behind it, and may be cut off" in result.stdout) == bool(half)
-        assert result.exit_code == 0, result.stderr
         return [one["n"] for one in told(result)], result.stderr
 
     seen, _ = answers(log, *rows[:30], half=rows[30][:-1])  # a row that is still being written
@@ -123,7 +115,6 @@ def test_a_guard_that_began_beside_a_machine_is_given_to_another_monitor(tmp_pat
     assert evofsm(*system, "--state", state, lines=rows).exit_code == 0
     for options in ((), ("--failed", "x>1 and x<9"), ("--state", other), ("--state", other)):
         result = evofsm("--guard", state, *options, lines=rows)
-        assert result.exit_code == 0, result.stderr
         assert told(result)[-1]["failed"] is True  # though --failed need not be typed again
 
 
@@ -274,7 +265,7 @@ def test_what_cannot_be_is_said_in_a_line(refused, arguments, said, tmp_path, mo
 @pytest.mark.slow
 def test_however_it_ends_it_goes_on_bit_for_bit(tmp_path):
     rows = [line(row) for row in traffic(90)]
-    by_hand, answers = expected(rows), []
+    by_hand, answers = answers_to(rows), []
     for part, name in enumerate(("SIGKILL", "SIGTERM", "SIGINT")):
         number = getattr(signal, name)
         with started("monitor", "--learn", "--state", tmp_path / "state.evofsm") as process:

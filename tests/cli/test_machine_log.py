@@ -11,6 +11,7 @@ from zoneinfo import ZoneInfo
 
 import polars
 import pytest
+from tests.cli.test_cli_monitor import told
 from tests.cli.test_watching import drive
 
 from evofsm import Guard
@@ -258,9 +259,8 @@ def test_where_summer_time_ends_rows_that_stand_still_are_none_of_an_hour_before
     again = *rows[:80], *rows[10:160], *rows[150:]  # from before it ended, and after
     Path("still.csv").write_text("\n".join(["Zeit;heat", *again, ""]))
     begun = "--observe", "heat", "--action", "", "--time", "Zeit", "--interval", 60
-    live = [json.loads(x) for x in evofsm("monitor", "still.csv", *begun).stdout.splitlines()]
     numbers = [*range(81), *range(11, 161), *range(151, 181)]
-    assert [answer["n"] for answer in live] == numbers
+    assert [answer["n"] for answer in told(evofsm("monitor", "still.csv", *begun))] == numbers
 
 
 def test_failures_right_after_a_hole_are_counted_wherever_others_are(evofsm):
@@ -311,8 +311,8 @@ def test_live_rows_stand_as_in_the_log_and_what_cannot_be_compared_is_refused(ev
     def answers(*rows):
         lines = [row if isinstance(row, str) else json.dumps(row) for row in rows]
         Path("rows.jsonl").write_text("\n".join([*lines, ""]))
-        told = evofsm("monitor", "rows.jsonl", *begun)
-        return [json.loads(line) for line in told.stdout.splitlines()]
+        live = evofsm("monitor", "rows.jsonl", *begun)
+        return [json.loads(line) for line in live.stdout.splitlines()]
 
     usual = {"heat": 6, "trip": 0, "runs": "yes"}
     dates = "10.03.2025 06:00:00", "10.03.2025, 6:01:00,0", "2025-03-10T06:02:00"
@@ -368,8 +368,7 @@ def test_live_rows_of_several_machines_become_no_means_of_them(evofsm):
     assert not evofsm("learn", "log.csv", *asked, "--scale", "heat=9", "--guard", "g").exit_code
     rows = [row for k, one in enumerate(log) for row in (one, f"{k},B,5,0", f"{k},C,5,0")]
     Path("live.csv").write_text("\n".join(["t,asset,heat,trip", *rows]))
-    live = evofsm("monitor", "--guard", "g", "live.csv")
-    found = [json.loads(line) for line in live.stdout.splitlines()]
+    found = told(evofsm("monitor", "--guard", "g", "live.csv"))
     ends = [one["time"] for one in found if one["kind"] == "end" and one["failed"]]
     assert ends == [*range(80, 241, 40)]  # each counts once
     assert found[2]["note"] == "asset B after A: a new episode"
@@ -460,18 +459,17 @@ def test_a_guard_from_zero_of_who_acts_learns_what_fails(evofsm, acts):
         time += 10.0
     Path("rows.jsonl").write_text("\n".join(map(json.dumps, rows)))
     fails = "--failed", "x>1 or x<-1", "--interval", 0.1, "--state", "cart.evofsm"
-    done = evofsm("monitor", "rows.jsonl", "--observe", "x,v", *acts, *fails)
-    answers = [json.loads(line) for line in done.stdout.splitlines()]
+    answers = told(evofsm("monitor", "rows.jsonl", "--observe", "x,v", *acts, *fails))
     ends = [answer for answer in answers if answer["kind"] == "end"]
     assert all("executed" in end for end in ends)
     refused = [answer for answer in answers if answer.get("advised") != answer.get("proposed")]
     assert all(one["alarm"] for one in refused)
     assert any(one["risk_proposed"] <= 0.02 for one in refused)  # for want of the margin alone
     assert [end["time"] for end in ends] == [row["time"] for row in rows if abs(row["x"]) > 1.0]
-    told = evofsm("inspect", "cart.evofsm")
-    assert told.exit_code == 0, told.stderr
-    told = " ".join(told.stdout.split())
-    assert re.search(r"fails where x is (below -1|above 1) or x is (below -1|above 1);", told)
+    learnt = evofsm("inspect", "cart.evofsm")
+    assert learnt.exit_code == 0, learnt.stderr
+    text = " ".join(learnt.stdout.split())
+    assert re.search(r"fails where x is (below -1|above 1) or x is (below -1|above 1);", text)
 
 
 def test_a_log_of_any_machine_is_watched(evofsm, written):

@@ -1,4 +1,5 @@
 import itertools
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -18,6 +19,12 @@ def made(learn=False, mode=Mode.SHADOW):
     guard = guard_of_monitor(0.1, 6.0)
     guard.learn, guard.reviser.mode = learn, mode
     return guard
+
+
+def answers_to(messages, learn=True, **settings):
+    """What a monitor says that nothing happens to."""
+    decider = Decider(made(learn), **settings)
+    return [decider.answer(message) for message in messages]
 
 
 @pytest.mark.parametrize("mode", [Mode.SHADOW, Mode.ACT])
@@ -238,11 +245,8 @@ def test_a_judge_that_raises_is_answered_and_gone_on_after(monkeypatch):
     decider = Decider(guard)
     first, second, third = (line(row) for row in rows(3))
     decider.answer(first)
-
-    def fails(*_):
-        raise RuntimeError("a bug of somebody's own")
-
     with monkeypatch.context() as patched:
+        fails = Mock(side_effect=RuntimeError("a bug of somebody's own"))
         patched.setattr(guard.judge, "judge", fails)
         answer = decider.answer(second)
     assert (answer["kind"], answer["about"], answer["n"]) == ("error", "guard", 2)

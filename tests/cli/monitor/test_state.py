@@ -1,8 +1,9 @@
 from contextlib import suppress
+from unittest.mock import Mock
 
 import msgspec
 import pytest
-from tests.cli.monitor.test_decider import full, made
+from tests.cli.monitor.test_decider import answers_to, full, made
 
 from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.monitor.slots import Slots
@@ -113,15 +114,10 @@ def test_a_journal_or_a_guard_that_was_lost_emptied_or_changed_is_said(tmp_path,
 @pytest.mark.parametrize("is_saved", [False, True])
 def test_killed_as_the_guard_is_saved_it_goes_on(opened, is_saved, monkeypatch):
     rows = [line(row) for row in traffic(702)]
-    plain = Decider(made(learn=True), episode=700)
-    expected = [plain.answer(row) for row in rows]
+    expected = answers_to(rows, episode=700)
     decider, state = opened()
-
-    def killed(*_):
-        raise SystemExit
-
     last = (state._journal, "begin_anew") if is_saved else (decider.guard, "save")
-    monkeypatch.setattr(*last, killed)
+    monkeypatch.setattr(*last, Mock(side_effect=SystemExit))
     with pytest.raises(SystemExit):
         any(decider.answer(row) is None for row in rows)
     abandoned(state)
@@ -132,8 +128,7 @@ def test_killed_as_the_guard_is_saved_it_goes_on(opened, is_saved, monkeypatch):
 def test_rows_in_flight_across_an_end_are_decided_once_though_it_is_killed(opened):
     rows = [line(row) for row in traffic(720)]
     messages = [*rows[:700], b'{"end": true, "failed": true}', *rows[700:]]
-    plain = Decider(made(learn=True))
-    expected = [plain.answer(message) for message in messages]
+    expected = answers_to(messages)
     decider, state = opened()
     for lost in (5, 695, 699, 702):  # the guard is written with message 700
         for message in messages[max(0, lost - 9) : lost + 9]:
@@ -147,8 +142,7 @@ def test_rows_in_flight_across_an_end_are_decided_once_though_it_is_killed(opene
 
 def test_rows_that_a_sender_does_not_wait_with_are_decided_once_though_it_is_killed(opened):
     rows = [line(row) for row in traffic(620)]
-    plain, answers = Decider(made(learn=True)), []
-    expected = [msgspec.json.decode(msgspec.json.encode(plain.answer(row))) for row in rows]
+    answers, expected = [], msgspec.json.decode(msgspec.json.encode(answers_to(rows)))
     for count in (400, 619, 999):  # with so many it is killed, before the last is answered
         decider, state = opened()
         keep, pieces = decider.keep, iter([b"".join(row + b"\n" for row in rows[len(answers) :])])
@@ -186,11 +180,7 @@ def test_what_cannot_be_taken_in_again_is_left_out_and_said(opened, monkeypatch,
     for message in [*(line(row) for row in traffic(3)), b'{"end": true}']:
         decider.answer(message)
     abandoned(state)
-
-    def fails(*_):
-        raise RuntimeError("another version")
-
-    monkeypatch.setattr(Guard, "end", fails)
+    monkeypatch.setattr(Guard, "end", Mock(side_effect=RuntimeError("another version")))
     decider, state = opened()
     assert (decider.n, decider.rows) == (3, 3)
     assert "a message is left out: another version" in caplog.text

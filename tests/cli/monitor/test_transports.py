@@ -14,6 +14,7 @@ from contextlib import contextmanager
 
 import pytest
 import zenoh
+from tests.cli.monitor.test_decider import answers_to
 
 from evofsm.cli.monitor.decider import Decider
 from evofsm.cli.monitor.messages import LONGEST
@@ -32,8 +33,7 @@ PATIENCE = 20.0
 @pytest.fixture(scope="module")
 def plain():
     """What is to be answered to `ROWS`."""
-    decider = Decider(guard_of_monitor(0.1, 6.0))
-    return [decider.answer(row) for row in ROWS]
+    return answers_to(ROWS)
 
 
 @contextmanager
