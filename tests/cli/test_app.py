@@ -71,6 +71,8 @@ def test_help_loads_nothing_heavy(command):
         (["inspect", "x", "--colour", "red"], "No such option: --colour"),
         (["drive", "paper", "--episodes", "0"], "Invalid value for '--episodes'"),
         (["drive", "paper", "--world", "moon"], "'moon' is not one of 'sumo', 'kinematic'"),
+        (["audit", "nowhere"], "no such file"),
+        (["audit", __file__, "--head", "abc"], "NUMBER:HASH"),
         (["drive", "nowhere"], "nowhere"),
         (["drive", "paper", "--reviser", "magic"], "magic"),
         (["drive", "emergency+rain"], "rain"),

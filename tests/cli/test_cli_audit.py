@@ -68,11 +68,6 @@ def test_the_record_that_was_tampered_with_is_named(evofsm, log):
     assert not found["is_good"]
 
 
-def test_what_cannot_be_read_is_refused(refused, log, tmp_path):
-    assert "no such file" in refused("audit", tmp_path / "none")
-    assert "NUMBER:HASH" in refused("audit", log[0], "--head", "abc")
-
-
 def is_too_close(z):
     return bool(z[0] <= 6.0)
 

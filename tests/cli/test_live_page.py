@@ -43,21 +43,17 @@ SCALES = "[...document.querySelectorAll('canvas')].map((one) => one.height - one
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("compiled")]
 
 
-@contextmanager
 def cars():
     roads = OnRoads(PAPER, KinematicWorld())
     learn_first(roads, 6)
-    with Session(roads) as opened:
-        yield opened
+    return Session(roads)
 
 
 def environment(what):
-    @contextmanager
     def session():
         system = read_simulated(what)
         learn_first(system, 12)
-        with Session(system) as opened:
-            yield opened
+        return Session(system)
 
     return session
 

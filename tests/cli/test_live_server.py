@@ -4,7 +4,7 @@ import json
 import math
 import socket
 import time
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, suppress
 from http.client import HTTPConnection
 from urllib.parse import urlsplit
 
@@ -27,10 +27,8 @@ def page(shown):
         yield page
 
 
-@contextmanager
 def session():
-    with Session(OnRoads(PAPER, KinematicWorld())) as opened:
-        yield opened
+    return Session(OnRoads(PAPER, KinematicWorld()))
 
 
 def get(page, path, host=None):

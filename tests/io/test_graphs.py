@@ -1,6 +1,7 @@
 """Graphs and processes, read back by others' tools, or by a reader written from PRISM's manual."""
 
 import re
+from itertools import product
 
 import numpy as np
 import pytest
@@ -75,11 +76,7 @@ def test_what_cannot_be_drawn_or_is_no_process_is_refused(model):
     empty.learn_many([[0.0], [1.0]], [0, 0])
     assert "is an estimate, no bound" in to_prism(model)
     assert "NO DECISION FAILED" in to_prism(empty.model())
-
-
-@pytest.mark.parametrize("least", [-0.1, 1.5, 30.0, np.nan])
-def test_what_is_left_out_is_said_by_a_probability(model, least):
-    for write in (to_dot, to_prism):
+    for write, least in product((to_dot, to_prism), (-0.1, 1.5, 30.0, np.nan)):
         with pytest.raises(ValueError, match=r"least of .* must lie between 0 and 1"):
             write(model, least=least)
 
