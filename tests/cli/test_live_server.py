@@ -155,6 +155,19 @@ def test_who_comes_late_is_shown_all_of_it(page):
     assert {"clock", "graph"} <= set(kinds)
 
 
+ACTS = {"revise": ("revising", False), "speed": ("speed", 8.0), "pause": ("paused", False)}
+
+
+def test_pages_act_on_the_run(page):
+    with looking_on(page) as client:
+        told(client, "clock")
+        for command, (name, value) in ACTS.items():
+            client.send(json.dumps({"do": command, "value": value}))
+            assert told(client, "clock")[name] == value
+        client.send('{"do": "case", "value": 3}')
+        assert told(client, "start")["case"] == 3
+
+
 def test_a_run_waits_for_the_first_who_looks_on(shown):
     with shown(session, speed=math.inf, awaits=True) as page:
         assert get(page, f"/{page.token}/")[0] == 200  # who loads the page only sees nothing yet
