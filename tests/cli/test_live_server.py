@@ -155,7 +155,7 @@ def test_who_comes_late_is_shown_all_of_it(page):
     assert {"clock", "graph"} <= set(kinds)
 
 
-ACTS = {"revise": ("revising", False), "speed": ("speed", 8.0), "pause": ("paused", False)}
+ACTS = {"revise": ("revising", False), "speed": ("speed", 8), "pause": ("paused", False)}
 
 
 def test_pages_act_on_the_run(page):

@@ -183,11 +183,10 @@ def test_two_clocks_of_different_rates_are_told(tmp_path, plugin, rate, warns):
 
 def test_what_has_a_name_in_a_message_is_known_by_it(tmp_path):
     """Joints and frames come in any order, and not all of them each time."""
-    types, none = STORE.types, np.zeros(0)
-    joints, header = types["sensor_msgs/msg/JointState"], odometry(0.0, 0.0).header
-    transforms, stamped = (types[f"{kind}"] for kind in ("tf2_msgs/msg/TFMessage", STAMPED))
-    vector, turned = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
-    moved = types["geometry_msgs/msg/Transform"]
+    types, none, header = STORE.types, np.zeros(0), odometry(0.0, 0.0).header
+    joints, transforms = types["sensor_msgs/msg/JointState"], types["tf2_msgs/msg/TFMessage"]
+    kinds = "Vector3", "Quaternion", "Transform", "TransformStamped"
+    vector, turned, moved, stamped = (types[f"geometry_msgs/msg/{kind}"] for kind in kinds)
     messages = []
     for k in range(40):
         names, values = ["gap", "own"], [float(k), 100.0]
@@ -212,7 +211,6 @@ def test_what_has_a_name_in_a_message_is_known_by_it(tmp_path):
         read(path, {"variables": dict.fromkeys(TOLD["variables"], "/joints.position[foot]")})
 
 
-STAMPED = "geometry_msgs/msg/TransformStamped"
 TF = "/tf.transforms[{}].transform.translation.x"
 
 
