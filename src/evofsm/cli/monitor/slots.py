@@ -151,7 +151,8 @@ class CsvRows:
         self.place, self.in_csv = f"line {self._count}: ", False
         begin = line.lstrip(b"\xef\xbb\xbf \t")[:1]
         if is_cut and begin not in (b"{", b""):  # a number would still be one
-            raise MessageError("line", "has no line end behind it, and may be cut off")
+            fault = "has no line end behind it, and may be cut off: end it, if it is whole"
+            raise MessageError("line", fault)
         self.heard = sha256(self.heard.encode() + line[:LONGEST]).hexdigest()
         self._may_be_title &= begin != b"{" and self._count < Dialect.most_above
         if begin in (b"{", b""):
