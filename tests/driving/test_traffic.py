@@ -34,6 +34,7 @@ ACTIONS = np.array([2.5, 0.0, -4.5, -9.0])
         (Object("h", 80.0, -6.0, 0.0, vy=4.0), None),  # crosses behind
         # Who stands lies along the road, whatever a sensor says of its speed.
         (Object("l", 130.0, 0.0, 0.0, vy=0.5, length=12.0), (Role.AHEAD, 1, 21.5, 20.0, 0.0)),
+        (Object("m", 125.0, 4.5, 0.0, vy=-0.9, length=12.0), (Role.CROSSING, 1, 21.6, 20.0, 0.0)),
         (Object("m", 115.0, 4.0, 0.0, vy=-0.01, length=12.0, width=2.5), None),
         (Object("j", 99.5, 3.5, 20.0, vy=-1.0), None),  # is beside, and comes closer
         (Object("k", 90.0, 3.5, 25.0, vy=-1.0), None),  # will be behind

@@ -201,6 +201,16 @@ def test_whatever_is_proposed_what_is_executed_can_be(make, mode, proposals, gus
     assert guard.machine.n_states >= (0 if 0 in missing else 1)
 
 
+def test_what_follows_on_an_action_beyond_the_range_teaches_nothing():
+    """Watched, somebody brakes harder than the guard could."""
+    guard, speed = guard_for_cars(-6.0, 2.0, interval=0.1, mode="shadow"), 30.0
+    for k in range(60):
+        wish = -9.0 if 10 <= k < 30 else 0.0
+        speed += 0.1 * guard.decide([80.0, speed, 30.0], wish).executed
+    assert guard.judge.brakes.decel <= 6.0
+    assert guard.machine.uses.sum() == 59 - 20
+
+
 def test_of_things_that_are_only_told_apart_a_kept_proposal_is_the_least_change():
     class Fixed(Balance):
         def judge(self, situation, actions):

@@ -121,6 +121,8 @@ class OwnBrakes:
         self._speed = speed
         self._estimate = speed if estimate is None else estimate
         self._commands = [*self._commands[-2:], demand]
+        if command < self.lowest - _SAME_COMMAND:  # harder than they can be asked to brake
+            self.clear()
 
     def _learn(self, realised: float, estimated: float, now: float, *, watched: bool) -> None:
         if self.known and len(self._commands) >= 2:

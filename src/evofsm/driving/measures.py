@@ -3,7 +3,8 @@
 Every function takes ``observations``, a (..., 3) ndarray of the gap [m], the speed of the follower
 and that of the leader [m/s]; where accelerations matter, a (..., T, 3) one in the order of time.
 Every class scores them: above 0 it calls for braking, and most scores are infinite where the cars
-have met. What hangs on a number that is NaN, is NaN. A leader with a negative speed comes towards
+have met. What hangs on a number that is NaN, is NaN, but that a row without one before it counts
+as one without acceleration. A leader with a negative speed comes towards
 oneself. An argument of a class that is not finite and positive raises a ValueError, except where 0
 is allowed.
 """

@@ -53,11 +53,13 @@ class Object(NamedTuple):
     y: float  #: of its centre, to the left [m]
     vx: float  #: [m/s]
     vy: float = 0.0  #: [m/s]
-    length: float = 5.0  #: along its heading; of who stands, up to 1 m/s, along the road [m]
+    length: float = 5.0  #: along its heading; of who stands, up to 0.5 m/s, along the road [m]
     width: float = 1.8  #: [m]
     ax: float = 0.0  #: [m/s²]
 
 
+# Where who is slower points is noise [m/s].
+_TURNS = 0.5
 # What is not seen of an object is as of most; where it is, and how fast, nobody can guess.
 _USUAL = [math.nan] * 5 + [Object._field_defaults[name] for name in COLUMNS[5:]]
 
@@ -149,7 +151,7 @@ def pairs_of(rows: ArrayLike) -> list[Pair]:
 
 def lies_across(vx: float, vy: float) -> bool | None:
     """Whether who moves so lies across the road; None where it stands, as far as a sensor tells."""
-    return abs(vy) > abs(vx) if max(abs(vx), abs(vy)) > -ONCOMING else None
+    return abs(vy) > abs(vx) if max(abs(vx), abs(vy)) > _TURNS else None
 
 
 def _pair(ego: list[float], obj: list[float], index: int) -> Pair | None:

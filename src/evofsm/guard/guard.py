@@ -36,6 +36,7 @@ from evofsm.guard.actions import (
     fixed,
     no_action,
     put_into,
+    same_action,
 )
 from evofsm.guard.api import (
     BELIEF_TOLERANCE,
@@ -330,7 +331,7 @@ class Guard:
             fault = "the judge has a method learn, but not all of a LearningJudge"
             raise ValueError(f"{fault}: it lacks {lacks}")
         for part, of in (("judge", judge), ("reviser", reviser)):
-            dt = getattr(of, "dt", interval)
+            dt = getattr(of, "dt", None) or self.interval
             if not math.isclose(dt, self.interval):
                 text = f"the {part} was made for decisions every {dt} s"
                 raise ValueError(f"interval is {interval} s, but {text}")
@@ -692,12 +693,15 @@ class Guard:
         raise ValueError(f"{name} would execute {action!r}, which is none of {self.actions}")
 
     def _take_in(self, situation: Situation, executed: Action) -> None:
-        """Machine and judge learn what was executed, or of the set what is closest to it."""
-        executed = put_into(self.actions, executed)
+        """Machine and judge learn what was executed; what follows on none of the set is not theirs.
+
+        A judge of cars is told of it, too: it knows what its own brakes cannot have done.
+        """
+        knows = self._learn and same_action(put_into(self.actions, executed), executed)
         self._decisions += 1
-        if self.machine is not None and self._learn and situation.state is not None:
+        if self.machine is not None and knows and situation.state is not None:
             self.machine.act(self.actions.encode(executed))
-        if self._observing is not None and self._learn:
+        if self._observing is not None and knows:
             self._observing.act(executed)
         if self.judge is None or (situation.intake and situation.intake & STALE):
             return

@@ -127,7 +127,9 @@ def passed(proposal: Proposal, usable: Usable, reviser: Reviser) -> Usable:
     can_pass = usable.remark and is_usable(reviser.actions, proposal.action)
     if not can_pass or getattr(reviser, "mode", Mode.ACT) is Mode.ACT:
         return usable
-    return Usable(fixed(proposal.action), usable.remark.partition(": ")[0])
+    is_barred = same_action(put_into(reviser.actions, proposal.action), proposal.action)
+    barred = f"proposal {action_text(proposal.action)} is not allowed here"
+    return Usable(fixed(proposal.action), barred if is_barred else usable.remark)
 
 
 class ActionReviser:

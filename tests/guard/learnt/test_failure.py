@@ -69,6 +69,16 @@ def test_of_failures_by_chance_a_form_of_one_says_nothing():
     assert (explain(FAILS, by_chance, known)[:, HELD] > 1).all()
 
 
+def test_among_failures_by_chance_a_threshold_at_which_many_failed_stays():
+    """One episode alone survived there, so that none was beyond."""
+    random, rows = np.random.default_rng(0), np.arange(600.0).reshape(300, 2) % 3
+    known = survived_as(np.vstack([rows, [3.0, 0.0]]), np.ones(2))
+    known = known._replace(highest=np.array([[3.0, 2.0], [2.0, 2.0]]))
+    at_end = np.column_stack([np.full(12, 3.0), random.uniform(0.0, 2.0, 12)])
+    told = explain(FAILS, np.vstack([at_end, random.integers(0, 3, (14, 2))]), known)
+    assert inside(told, at_end).all()
+
+
 @pytest.mark.parametrize("shape", SHAPES)
 def test_forms_explain_failures_and_nothing_that_was_survived_is_inside(shape):
     seen = np.random.default_rng(0).uniform(-2.0, 2.0, (2000, 3))

@@ -303,8 +303,9 @@ def explain(says: int, failures: Floats, survived: Survived) -> Floats:
     within: Flags = np.asarray(inside(bent, failures).any(0))
     keep = [bool(s or not within[holds].all()) for s, holds in zip(strong, by, strict=True)]
     table = counted(np.concatenate([stay[keep], bent]), failures, survived)
-    if says == FAILS and 2 * inside(table, failures).any(0).sum() < k:  # most are by chance
-        return table[table[:, HELD] > 1]
+    by = inside(table, failures)
+    if says == FAILS and 2 * by.any(0).sum() < k:  # most are by chance
+        table = table[by.sum(1) > 1]
     return table
 
 

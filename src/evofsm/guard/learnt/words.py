@@ -38,7 +38,10 @@ from evofsm.guard.learnt.state import State
 
 #: Said as long as there is nothing to judge by.
 NOTHING_LEARNT = "nothing was learnt yet"
-NEVER_WHOLE = "nothing was learnt: no episode had three observations in a row without NaN"
+NEVER_WHOLE = (
+    "nothing was learnt: no episode had three observations in a row without NaN, with actions of "
+    "the guard's range between them"
+)
 NOTHING_SEEN = "not each variable was observed yet in this episode"
 #: Said where it is far from all that was seen, or was not seen whole for long.
 BY_MODEL = "by the model alone, so its risk is not known: "
@@ -197,11 +200,10 @@ def _where(table: Floats, names: Sequence[str]) -> tuple[str, list[str], list[st
     places: dict[int, list[str]] = {FAILS: [], ENDS: [], CRASHES: [], FATAL: []}
     sides = []
     for row, is_side in zip(table, failure.are_sides(table), strict=True):
-        text = region(names, row[I:HELD].tolist(), int(row[HELD]), _WHAT[int(row[SAYS])])
+        place, count, what = row[I:HELD].tolist(), int(row[HELD]), _WHAT[int(row[SAYS])]
+        text = region(names, place, count, what)
         if is_side and row[SAYS] == FAILS:
-            name, _, beyond = text.removeprefix("where ").partition(" (")[0].rpartition(" is ")
-            at = "at or " * (not row[HELD])  # what failed was at the end of what was survived
-            sides.append(f"{name} is {at}{beyond}")
+            sides.append(text.removeprefix("where ").removesuffix(f" ({counted(count, what)})"))
         else:
             places[int(row[SAYS])].append(text)
     there = [" or ".join([f"where {' or '.join(sides)}"] * bool(sides) + places[FAILS])]
@@ -220,7 +222,7 @@ def here(
     away = failure.distances(forms, z[None])[:, 0]
     if away.min(initial=math.inf) <= near:
         row, distance = forms[int(away.argmin())], float(away.min())
-        where = "" if distance < 0.0 else f"{changes(distance)} from "
+        where = "" if distance <= 0.0 else f"{changes(distance)} from "
         place = region(names, row[I:HELD].tolist(), int(row[HELD]))
         text = f"This is {where}where it fails: {place.removeprefix('where ')}."
     off = np.sqrt((((state.centres - z) * model.inverse) ** 2).sum(1)) - state.radii
@@ -236,6 +238,8 @@ def here(
 def region(names: Sequence[str], row: Sequence[float], count: int, what: str = "failure") -> str:
     """Where a form is (columns I to R of its row), in which so many failures were seen.
 
+    Of a threshold that none was beyond, some were at the end of what was survived.
+
     Examples
     --------
     >>> region(["x", "y"], [0, 1, 101325.0, 2.0, 1.0, 0.5, 4.0, 0.0, 0.0, -1.0, 0.0, -1.0], 3)
@@ -243,27 +247,28 @@ def region(names: Sequence[str], row: Sequence[float], count: int, what: str = "
     >>> region(["x", "y"], [0, 1, 0.0, 0.0, 1.0, 1.0, -5.0, 3.0, 4.0, 0.0, 0.0, 0.0], 1)
     'where 0.6 x + 0.8 y is above 1 (1 failure)'
     """
-    note = f"({counted(count, what)})"
+    note = f" ({counted(count, what)})" if count else ""
     i, j, at, to, sx, sy, c, b, d, p, q, r = row
     x, y = in_a_line(names[int(i)]), in_a_line(names[int(j)])
     if i == j:
         if p == 0.0 and b != 0.0:
             beyond = _figures(at - c / (b * sx), sx, 4)
-            return f"where {x} is {'above' if b > 0.0 else 'below'} {beyond} {note}"
+            beside, way = "at or " * (not count), "above" if b > 0.0 else "below"
+            return f"where {x} is {beside}{way} {beyond}{note}"
         spare = b * b - 4.0 * p * c
         if p == 0.0 or spare < 0.0:
-            return f"where {x} is near {_figures(at, sx)} {note}"
+            return f"where {x} is near {_figures(at, sx)}{note}"
         ends = sorted(at + (-b + sign * math.sqrt(spare)) / (2.0 * p * sx) for sign in (1, -1))
         first, last = (_figures(end, sx) for end in ends)
         if p < 0.0:
-            return f"where {x} is between {first} and {last} {note}"
-        return f"where {x} is below {first} or above {last} {note}"
+            return f"where {x} is between {first} and {last}{note}"
+        return f"where {x} is below {first} or above {last}{note}"
     if p == q == r == 0.0:
         length = math.hypot(b * sx, d * sy)
         u, v = b * sx / length, d * sy / length
         per, sign = length / math.hypot(b, d), "+" if v >= 0.0 else "-"
         text = f"{_figures(u, per * abs(at))} {x} {sign} {_figures(abs(v), per * abs(to))} {y}"
-        return f"where {text} is above {_figures(u * at + v * to - c / length, per)} {note}"
+        return f"where {text} is above {_figures(u * at + v * to - c / length, per)}{note}"
     inner = p * r - 0.25 * q * q
     if inner > 0.0:
         u, v = (0.25 * q * d - 0.5 * r * b) / inner, (0.25 * q * b - 0.5 * p * d) / inner
@@ -273,8 +278,8 @@ def region(names: Sequence[str], row: Sequence[float], count: int, what: str = "
             where = f"around ({_figures(at + u / sx, sx)}, {_figures(to + v / sy, sy)})"
             size = f"{wide / sx:.3g} wide and {high / sy:.3g} high"
             side = "inside" if p < 0.0 else "outside"
-            return f"{side} an ellipse of {x} and {y} {where}, {size} {note}"
-    return f"beyond a curve of {x} and {y}, as at ({_figures(at, sx)}, {_figures(to, sy)}) {note}"
+            return f"{side} an ellipse of {x} and {y} {where}, {size}{note}"
+    return f"beyond a curve of {x} and {y}, as at ({_figures(at, sx)}, {_figures(to, sy)}){note}"
 
 
 def _figures(value: float, inverse: float, least: int = 3) -> str:
