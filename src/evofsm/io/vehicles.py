@@ -14,7 +14,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import chain, islice, starmap
+from itertools import chain, islice
 from typing import Any, NamedTuple, NoReturn
 from xml.parsers import expat
 
@@ -34,7 +34,7 @@ COLUMNS = ("time", *VARIABLES, ACTION)  #: what is known of a pair at one time
 _ROWS_AT_ONCE = 8192
 # Rows that may wait before all are handed on, of 32 bytes each; a pair that is cut loses one step.
 _MOST_WAITING = 1_000_000
-_JUMP = 3.0  # by which a gap changes more [m], and a name is another vehicle's
+_JUMP = 3.0  # by which a gap changes more [m] and stays, and a name is another vehicle's
 _MOST_ON_A_LANE = 1000  # more at one time are no recording of a road, and take long
 
 # What is said where nothing is on a lane.
@@ -70,7 +70,7 @@ class Vehicle(NamedTuple):
 
 #: Time [s], where it stands, and all that is there then: where, and what stands there by its name.
 Moment = tuple[float, Place, list[tuple[Place, Mapping[str, Any]]]]
-_Pair = tuple[str, str, str]  #: lane, follower and leader
+_Pair = tuple[str, str]  #: follower and leader, on whichever lane
 
 
 @dataclass
@@ -88,9 +88,9 @@ class PairTable(Table):
     def pieces(self, wanted: Wanted) -> Iterator[Piece]:
         """All columns, whichever are wanted."""
         before, starts, blocks, names = 0, [0], list[NDArray[np.float64]](), list[str]()
-        for (_, follower, leader), rows in chain(self._episodes(), [(("", "", ""), None)]):
-            if rows is not None:
-                blocks.append(_with_actions(rows))
+        for (follower, leader), rows in chain(self._episodes(), [(("", ""), None)]):
+            for block in () if rows is None else map(_with_actions, _apart(rows)):
+                blocks.append(block)
                 names.append(f"{follower} behind {leader}")
                 starts.append(starts[-1] + len(blocks[-1]))
             if blocks and (rows is None or starts[-1] >= _ROWS_AT_ONCE):
@@ -123,16 +123,11 @@ class PairTable(Table):
             before = time
             present: dict[_Pair, array[float]] = {}
             nearest: dict[str, tuple[float, _Pair, Three]] = {}
-            for pair, numbers in chain.from_iterable(starmap(self._pairs, lanes)):
+            for pair, numbers in chain.from_iterable(map(self._pairs, lanes)):
                 entry = numbers[0], pair, numbers  # of all lanes that it is on
-                nearest[pair[1]] = min(entry, nearest.get(pair[1], entry))
+                nearest[pair[0]] = min(entry, nearest.get(pair[0], entry))
             for _, pair, numbers in nearest.values():
                 rows = open_pairs.pop(pair, None) or array("d")
-                if rows:  # how far both can have driven since then
-                    way = (time - rows[-4]) * sum(map(abs, (*numbers[1:], *rows[-2:])))
-                    if abs(numbers[0] - rows[-3]) > _JUMP + way:
-                        yield pair, rows
-                        rows = array("d")
                 rows.extend((time, *numbers))
                 present[pair] = rows
             yield from open_pairs.items()  # who has parted
@@ -146,7 +141,7 @@ class PairTable(Table):
 
     def _lanes(
         self, time: float, cars: Iterable[Vehicle], headings: dict[str, complex]
-    ) -> Iterable[tuple[str, list[Vehicle]]]:
+    ) -> Iterable[list[Vehicle]]:
         """Who is on each lane, once; who does not say where it points does so as before."""
         lanes: defaultdict[str, list[Vehicle]] = defaultdict(list)
         names = set[str]()
@@ -162,9 +157,9 @@ class PairTable(Table):
             headings[car.name] = car.heading
             for lane in dict.fromkeys(car.lanes):
                 lanes[lane].append(car)
-        return sorted(lanes.items()) if self.lengths else lanes.items()
+        return [lanes[name] for name in sorted(lanes)] if self.lengths else lanes.values()
 
-    def _pairs(self, name: str, lane: list[Vehicle]) -> Iterator[tuple[_Pair, Three]]:
+    def _pairs(self, lane: list[Vehicle]) -> Iterator[tuple[_Pair, Three]]:
         """Each vehicle of a lane and the nearest one ahead, not beside its way nor towards it.
 
         With it come the gap, bumper to bumper [m], and both speeds [m/s].
@@ -191,7 +186,7 @@ class PairTable(Table):
                     gap = distance - (car.front + leader.rear)
                     if self.lengths and gap <= 0.0 and aside > _IN_LINE:
                         self.lengths.overlaps[leader.kind] += 1
-                    yield (name, car.name, leader.name), (gap, car.speed, leader.speed)
+                    yield (car.name, leader.name), (gap, car.speed, leader.speed)
                     break
 
 
@@ -214,9 +209,25 @@ def _ahead(
             yield lane[place], float(along[place]), float(distances[place])
 
 
-def _with_actions(rows: array[float]) -> NDArray[np.float64]:
-    """(T, 5) `COLUMNS`; the action is NaN in the last row, and where it is beyond any number."""
+def _apart(rows: array[float]) -> list[NDArray[np.float64]]:
+    """(T, 4) Rows of a pair, apart where its gap jumps and stays there; a single one is noise."""
     table = np.array(rows).reshape(-1, 4)
+
+    def jumps(n: int) -> NDArray[np.bool_]:
+        times, gaps, *_ = np.abs(table[n:] - table[:-n]).T
+        speeds = np.abs(table[n:, 2:]) + np.abs(table[:-n, 2:])
+        return gaps > _JUMP + times * speeds.sum(axis=1)  # which both can have driven
+
+    with np.errstate(over="ignore"):
+        anew, noise = jumps(1), ~jumps(2)
+    noise &= anew[:-1] & anew[1:]
+    anew[:-1] &= ~noise
+    anew[1:] &= ~noise
+    return np.split(table, np.flatnonzero(anew) + 1)
+
+
+def _with_actions(table: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(T, 5) `COLUMNS`; the action is NaN in the last row, and where it is beyond any number."""
     with np.errstate(over="ignore"):
         actions = np.append(np.diff(table[:, 2]) / np.diff(table[:, 0]), np.nan)
     actions[np.isinf(actions)] = np.nan
