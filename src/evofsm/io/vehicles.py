@@ -216,7 +216,8 @@ def _apart(rows: array[float]) -> list[NDArray[np.float64]]:
     def jumps(n: int) -> NDArray[np.bool_]:
         times, gaps, *_ = np.abs(table[n:] - table[:-n]).T
         speeds = np.abs(table[n:, 2:]) + np.abs(table[:-n, 2:])
-        return gaps > _JUMP + times * speeds.sum(axis=1)  # which both can have driven
+        excess: NDArray[np.float64] = gaps - times * speeds.sum(axis=1)  # they cannot have driven
+        return excess > _JUMP
 
     with np.errstate(over="ignore"):
         anew, noise = jumps(1), ~jumps(2)
