@@ -47,7 +47,13 @@ def test_a_guard_is_written_in_c_and_for_cpp_to_a_folder(evofsm, refused, driven
     caplog.clear()  # it was driven in shadow
     act = "--mode", "act", "--out"
     assert evofsm("export", driven, "--to", "c99", *act, tmp_path / "c").exit_code == 0
-    assert "\n#define ACTS 1\n" in (tmp_path / "c" / "evofsm.c").read_text()
+    code, header = (tmp_path / "c" / f"evofsm.{end}" for end in "ch")
+    assert "\n#define ACTS 1\n" in code.read_text()
+    header.unlink()
+    code.write_text("")
+    assert evofsm("export", driven, "--to", "c99", *act, tmp_path / "c").exit_code == 0
+    code.write_text("int main;")
+    assert "left alone" in refused("export", driven, "--to", "c99", *act, tmp_path / "c")
     evofsm("export", driven, "--to", "fmu", *act, tmp_path / "cars.fmu")
     assert is_zipfile(tmp_path / "cars.fmu")
     assert "it watches" not in caplog.text
@@ -86,6 +92,7 @@ def test_what_cannot_be_exported_is_refused_in_one_line(refused, driven, words, 
         ("my.csv", "export {out} --to prism --out {path}"),
         ("main.c", "export {out} --to c99 --prefix main --out {folder}"),
         ("index.html", "paper --out {folder}"),
+        ("model.evofsm", "paper --out {folder}"),
         ("guard.evofsm", "drive emergency --out {folder}"),
         ("episodes.csv", "drive emergency --out {folder}"),
         ("guard.evofsm", "learn {path} --action= --out {path}"),
@@ -93,10 +100,12 @@ def test_what_cannot_be_exported_is_refused_in_one_line(refused, driven, words, 
 )
 def test_what_something_else_wrote_is_left_alone(refused, driven, tmp_path, name, words):
     path, ours = tmp_path / name, driven / "guard.evofsm"
-    path.write_bytes(content := ours.read_bytes() if name == ours.name else b"<?xml")
+    page = "<title>Mine – evofsm</title>".encode()
+    path.write_bytes(content := ours.read_bytes() if path.suffix == ours.suffix else page)
+    (empty := tmp_path / "episodes.jsonl").touch()
     given = words.format(out=driven, folder=tmp_path, path=path).split()
     assert "it was left alone" in refused(*given)
-    assert ([*tmp_path.iterdir()], path.read_bytes()) == ([path], content)
+    assert ({*tmp_path.iterdir()}, path.read_bytes()) == ({path, empty}, content)
 
 
 def test_no_text_from_a_file_tells_the_terminal_what_to_do(evofsm, tmp_path):

@@ -31,14 +31,17 @@ def test_all_claims_hold_in_sumo_as_the_docs_show_them_and_all_of_it_is_written(
 
 
 @pytest.mark.slow
-def test_a_claim_that_fails_is_shown_and_ends_with_1(evofsm, tmp_path, monkeypatch):
+def test_a_claim_that_fails_is_shown_and_ends_with_1(evofsm, refused, tmp_path, monkeypatch):
     coarse = Settings.load({"machine": {"radius": 30.0}})
     monkeypatch.setattr(Settings, "load", lambda: coarse)
-    told = "--world", "kinematic", "--rounds", 1
-    run = evofsm("paper", *told, "--json", "--out", tmp_path / "out")
-    assert run.exit_code == 1, run.stderr
+    told = "paper", "--world", "kinematic", "--rounds", 1, "--json", "--out", tmp_path / "out"
+    for _ in range(2):  # anew, too
+        run = evofsm(*told)
+        assert run.exit_code == 1, run.stderr
     failing = [claim["id"] for claim in json.loads(run.stdout) if not claim["holds"]]
     assert "states_final" in failing
+    (tmp_path / "out" / "model.evofsm").write_text("mine")
+    assert "it was left alone" in refused(*told)
 
 
 def test_a_folder_that_cannot_be_is_said_before_anything_is_driven(refused, tmp_path, monkeypatch):

@@ -15,6 +15,13 @@ from typer import Context
 from evofsm.cli import options
 from evofsm.cli.options import argument, option
 
+# What stands in the beginning of each file of a reproduction.
+_MARKS = {
+    "index.html": "<title>Does the paper&#39;s machine do what the paper says? – evofsm</title>",
+    "claims.json": '"id": "collisions_by_case"',
+    "model.evofsm": "evofsm paper",
+}
+
 
 def paper(
     world: options.InWorld = "sumo",
@@ -28,8 +35,7 @@ def paper(
     """
     options.require_world(world, polars="tables", matplotlib="plot", jinja2="plot")
     out.mkdir(parents=True, exist_ok=True)  # where that fails nothing is driven first
-    files = ("index.html", "claims.json", "model.evofsm")
-    options.refuse_foreign("evofsm</title>", *(out / name for name in files))
+    options.refuse_foreign({out / name: mark for name, mark in _MARKS.items()})
     from evofsm.cli.show import print_json, print_page, progress
     from evofsm.driving.sumo import open_world
     from evofsm.paper import Settings, check_claims, run_paper

@@ -120,10 +120,11 @@ class Results:
 
     def _begin(self, folder: Path) -> None:
         setup = self.setup
-        files = [folder / name for name in (_JOURNAL, GUARD, _EPISODES, _DECISIONS)]
-        refuse_foreign("", *files)  # a foreign journal says so itself
+        journal = folder / _JOURNAL  # a foreign one says so itself
+        if not (journal.is_file() and journal.stat().st_size):
+            refuse_foreign({folder / name: None for name in (GUARD, _EPISODES, _DECISIONS)})
         folder.mkdir(parents=True, exist_ok=True)
-        self._journal = Journal(folder / _JOURNAL, "name another folder")
+        self._journal = Journal(journal, "name another folder")
         try:
             self._journal.go_on(setup.settings, "run it with those, or name another folder")
             self.rows = {int(row["episode"]): row for row in self._journal.records}

@@ -10,9 +10,9 @@ from typing import Annotated, Any, Literal
 from evofsm.cli import options
 from evofsm.cli.options import Json, ModeName, Saved, option
 
-# What stands in the beginning of files of each format, of c99 of the header.
-_MARKS = {"dot": "digraph evofsm", "prism": "// A machine of", "c99": "/* Exported by evofsm"}
-_MARKS["fmu"] = "modelDescription.xml"
+# What stands in the beginning of files of each format, and of each file of c99.
+_MARKS = {"dot": "digraph evofsm", "prism": "// A machine of", "fmu": "modelDescription.xml"}
+_MARKS_OF_C = {"h": "/* Exported by evofsm"} | dict.fromkeys(("hpp", "c"), "of different exports")
 _UNTOLD = (
     "Which episodes failed is not known: nothing said so. From a log, evofsm learn "
     "--failed COLUMN or --failed 'gap<=0' says it."
@@ -131,9 +131,9 @@ def export(
     ] = None,
 ) -> None:
     """Write what was learnt, or driven, in the formats of other tools."""
-    names = [f"{prefix or 'evofsm'}.{suffix}" for suffix in ("h", "hpp", "c")]
     if out is not None:
-        options.refuse_foreign(_MARKS[to], *(out / name for name in names if to == "c99"), out)
+        of_c = {out / f"{prefix or 'evofsm'}.{end}": mark for end, mark in _MARKS_OF_C.items()}
+        options.refuse_foreign(of_c if to == "c99" else {out: _MARKS[to]})
     is_code = to in ("c99", "fmu")
     unfit: Any = {"--least": least, "--evidence": evidence} if is_code else {"--mode": mode}
     unfit |= {} if to == "c99" else {"--prefix": prefix}

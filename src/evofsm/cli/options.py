@@ -93,14 +93,14 @@ def picture(out: Path, width: float, height: float) -> Iterator[Figure]:
         figure.savefig(out)
 
 
-def refuse_foreign(mark: str, *paths: Path) -> None:
-    """Raise where a file would be written over, and the first begins without the mark of ours."""
-    for path in filter(Path.is_file, paths):
+def refuse_foreign(marks: Mapping[Path, str | None]) -> None:
+    """Raise where a file that is not empty would be written over, and begins without its mark."""
+    for path in filter(Path.is_file, marks):
         with path.open("rb") as file:
-            if path == paths[0] and mark.encode() in file.read(1000):
-                return
-        text = "is not what would be written there anew; it was left alone: name another one"
-        raise FileExistsError(f"{path} {text}")
+            begin, mark = file.read(1000), marks[path]
+        if begin and (mark is None or mark.encode() not in begin):
+            text = "is not what would be written there anew; it was left alone: name another one"
+            raise FileExistsError(f"{path} {text}")
 
 
 def require_world(world: str, **extras: str) -> None:

@@ -66,7 +66,7 @@ def write(study: PaperStudy, folder: Path, command: str) -> Path:
     claims = [claim._asdict() for claim in check_claims(study)]
     text = json.dumps(claims, indent=2, ensure_ascii=False)
     (folder / "claims.json").write_text(f"{text}\n", encoding="utf-8")
-    study.model.save(folder / "model.evofsm")
+    study.model.save(folder / "model.evofsm", {"learnt by": "evofsm paper"})
     return page
 
 
