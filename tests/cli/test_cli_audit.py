@@ -63,9 +63,12 @@ def test_the_record_that_was_tampered_with_is_named(evofsm, log):
     said = " ".join(result.output.split())
     assert "TAMPERED WITH at record 5: record 5 was altered" in said
     assert "2 decisions as recorded" in said  # those before it
-    found = json.loads(evofsm("audit", path, "--json").stdout)
+    found = json.loads(evofsm("audit", path, "--json", "--failed", "other<0").stdout)
     assert found["finding"]["record"] == 5
     assert not found["is_good"]
+    path.write_bytes(b"".join([lines[0].replace(b'"guard":"', b'"guard":"!!'), *lines[1:]]))
+    forged = evofsm("audit", path, "--failed", "gap<0")
+    assert (forged.exit_code, "at record 1" in forged.output) == (1, True)
 
 
 def is_too_close(z):

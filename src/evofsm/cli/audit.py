@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from base64 import b64decode
+from collections import deque
 from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
@@ -62,9 +63,12 @@ def _failure(file: Path, text: str) -> Any:
 
     if re.fullmatch(r"[\w.]+:[\w.]+", text):
         return imported(text)
-    first = next(Chain(file).records(), None)
+    records = (chain := Chain(file)).records()
+    first, *_ = next(records, None), deque(records, maxlen=0)
     data = first and first.content.get("guard")
-    names = load_guard(BytesIO(b64decode(data))).variables if data else ()
+    if chain.finding or not data:
+        return None  # the examination says it
+    names = load_guard(BytesIO(b64decode(data))).variables
     if (condition := failure(text, names)) is None:
         fault = f"the guard in {file} observes {', '.join(names) or 'what has no names'}"
         raise ValueError(f"--failed {text} is of other columns: {fault}")
