@@ -253,7 +253,7 @@ def test_local_time_of_irregular_rows_runs_on_where_summer_time_changes(evofsm, 
 
 def test_where_summer_time_ends_rows_that_stand_still_are_none_of_an_hour_before(evofsm):
     at, zone, rows = datetime(2025, 10, 25, 23, 30, tzinfo=UTC), ZoneInfo("Europe/Berlin"), []
-    for k in range(180):
+    for k in [*range(90), *range(93, 183)]:  # no first ones of the second hour
         local = (at + timedelta(minutes=k)).astimezone(zone)
         rows.append(f"{local:%d.%m.%Y %H:%M:%S};20")
     again = *rows[:80], *rows[10:160], *rows[150:]  # from before it ended, and after
