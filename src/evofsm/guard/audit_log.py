@@ -445,6 +445,17 @@ class AuditLog(Ledger, Recorder, AbstractContextManager["AuditLog"]):
     def __exit__(self, *error: object) -> None:
         self.close()
 
+    def go_on(self) -> None:
+        """Go on after a failure; a file that was removed or cut meanwhile is read anew."""
+        if self._is_owner() and self.path.exists():
+            status = self.path.stat()
+            is_same = os.path.samestat(status, os.fstat(self._file.fileno()))
+            if is_same and status.st_size >= self._size:
+                self._failure = None
+                return Recorder.__init__(self)  # the guard is written down again
+        super().close()
+        AuditLog.__init__(self, self.path, sync=self.sync)
+
     def told_again(self, after: Head) -> None:
         """Write nothing twice of what followed a record, as a guard is told that once more."""
         records = Chain(self.path).records()

@@ -236,11 +236,12 @@ class Decider:
         self._said -= {"often", "fast"}
         if (log := self._lost) is not None:
             with suppress(OSError, ValueError):  # tried again as the next one ends
-                self.guard.audit, self._lost = AuditLog(log.path, sync=log.sync), None
+                log.go_on()
+                self.guard.audit, self._lost = log, None
 
     def close(self) -> None:
         """Close the audit log; an OSError where decisions are missing in it."""
-        if isinstance(log := self.guard.audit, AuditLog):
+        if isinstance(log := self._lost or self.guard.audit, AuditLog):
             log.close()
         if self._unlogged is not None:
             raise self._unlogged
@@ -432,8 +433,6 @@ class Decider:
             if not isinstance(log := self.guard.audit, AuditLog):
                 raise
             _log.error("without an audit log until an episode ends: %s", error)
-            with suppress(OSError):
-                log.close()
             self.guard.audit, self._lost, self._unlogged = None, log, error
             return call()
 
