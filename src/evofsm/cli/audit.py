@@ -65,8 +65,7 @@ def _failure(file: Path, text: str) -> Any:
         return imported(text)
     records = (chain := Chain(file)).records()
     first, *_ = next(records, None), deque(records, maxlen=0)
-    data = first and first.content.get("guard")
-    if chain.finding or not data:
+    if chain.finding or not (data := first and first.content.get("guard")):
         return None  # the examination says it
     names = load_guard(BytesIO(b64decode(data))).variables
     if (condition := failure(text, names)) is None:

@@ -448,9 +448,8 @@ class AuditLog(Ledger, Recorder, AbstractContextManager["AuditLog"]):
     def go_on(self) -> None:
         """Go on after a failure; a file that was removed or cut meanwhile is read anew."""
         if self._is_owner() and self.path.exists():
-            status = self.path.stat()
-            is_same = os.path.samestat(status, os.fstat(self._file.fileno()))
-            if is_same and status.st_size >= self._size:
+            status, now = os.fstat(self._file.fileno()), self.path.stat()
+            if os.path.samestat(status, now) and now.st_size >= self._size:
                 self._failure = None
                 return Recorder.__init__(self)  # the guard is written down again
         super().close()

@@ -42,7 +42,6 @@ _log = logging.getLogger(__name__)
 EPISODE = 6000  #: rows until an episode ends; with an alarm on, at most twice as many
 _RECENT = 256  # so many of the latest messages are known again when they are sent again
 _FAST = 60.0  # nothing on a road is faster [m/s]
-_HALF = 1800.0  # in the hour that comes twice, up to so far on rows are new, not sent again [s]
 _LATE = 1.0  # what is older by less is late, by more from a sender that began anew [s]
 HOLE, _OFTEN = 1.5, 0.5  #: a gap in time, and rows that come too often, in intervals
 _AX, _VX, _VY, _Y = map(COLUMNS.index, ("ax", "vx", "vy", "y"))
@@ -145,7 +144,7 @@ class Decider:
         place = len(self._recent) if self._next is None else self._next + 1
         successor = [m for m, _ in islice(self._recent, place, place + 1)]  # of one sent again
         step = time + 3600.0 * ways[-1] - rows[-1].time
-        older = [] if 0.0 < step <= _HALF else rows
+        older = [] if 0.0 < step <= 1800.0 else rows  # where a gap is likelier
         copies = (m for rows_then in (successor, older) for m in messages if m in rows_then)
         return next(copies, messages[-1])  # sent again, as it was
 
