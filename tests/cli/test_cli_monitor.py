@@ -126,10 +126,13 @@ def test_csv_is_read_in_the_units_that_stood_below_the_names_of_the_log(tmp_path
     rows = [f"{k / 10},{far:.4f},20,20,0" for k in range(40)]
     log.write_text("\n".join([names, "s,ft,m/s,m/s,m/s²", *rows, ""]))
     learn = ["learn", str(log), "--guard", str(guard)]
-    assert CliRunner().invoke(application(), learn).exit_code == 0
+    learnt = CliRunner().invoke(application(), learn)
+    assert "CSV without a row of units has gap in ft." in learnt.output
     if goes_on:
         evofsm("--guard", guard, "--state", state)
         guard = state
+    log.write_text("\n".join([names, f"0.0,{far},20,15,0", f"0.1,{far},20,15,0", ""]))
+    assert "1, or " in evofsm(log, "--summary", "--guard", guard).stdout  # an alarm
     risks = []
     for unit, gap in (("", far), ("s,ft,m/s,m/s,m/s²", far), ("s,m,m/s,m/s,m/s²", 10.0)):
         lines = [names, *[unit] * bool(unit), f"0.0,{gap:.4f},20,15,0"]

@@ -95,7 +95,7 @@ def learn(
         fault = "is always the same, so that nothing tells what others would do (--action '')"
         raise ValueError(f"--guard: {columns.action} {fault}")
     model, counts = lesson.model, lesson.counts
-    provenance = {
+    provenance: dict[str, Any] = {
         "files": [{"name": n, "bytes": size} for n, size in zip(files, sizes, strict=True)],
         **{name: counts[name] for name in ("rows", "episodes", "transitions", "failures")},
         "read with": {k: v for k, v in reading.items() if k != "topics"},
@@ -141,7 +141,7 @@ def learn(
         say(f"Saved to {out}. Look at it again: evofsm inspect {out}")
     if new_guard is not None:
         beyond = (counts["clipped_below"] + counts["clipped_above"]) / counts["rows"]
-        for line in learning.told_of_guard(new_guard, guard, brakes, beyond):
+        for line in learning.told_of_guard(new_guard, guard, provenance["units"], brakes, beyond):
             say(line)
 
 

@@ -367,13 +367,17 @@ def check_out(out: Path | None, kind: str, option: str = "--out") -> None:
 # -- What came of it ------------------------------------------------------------------------------
 
 
-def told_of_guard(guard: Guard, path: Path | None, brakes: float, beyond: float) -> Iterator[str]:
+def told_of_guard(
+    guard: Guard, path: Path | None, units: Mapping[str, str], brakes: float, beyond: float
+) -> Iterator[str]:
     """Where it is, what it takes, and what it reckons with."""
     judge = guard.judge
     assert judge is not None
     names = map(judge.labels.variable, range(len(guard.variables)))
     also = "" if isinstance(judge, Foresight) else ", and proposal, the action"
     takes = f"evofsm monitor --guard {path} takes rows of {', '.join(['time [s]', *names])}{also}."
+    texts = ", ".join(f"{name} in {unit}" for name, unit in units.items())
+    takes += f" CSV without a row of units has {texts}." * bool(units)
     yield f"The guard was saved to {path}. {takes}"
     if isinstance(judge, Foresight):
         words, days = judge.alarm_in_words, judge.days

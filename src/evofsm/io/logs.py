@@ -327,6 +327,8 @@ class LogColumns:
         holds ends the episode in failure. Without it nothing tells of failures.
     units : mapping, optional
         Units by the column, or the beginning of columns, that are not those of the SI: ``"km/h"``.
+    usual_units : mapping, optional
+        Units by the column of CSV, where neither a row of units nor ``units`` says others.
     no_leader : str, optional
         Rows that end the episode, and are left out: ``"end"``, in which an observed number is
         missing; or a condition, as ``failed`` takes one.
@@ -357,6 +359,7 @@ class LogColumns:
     dt: float | None = None
     failed: str | None = None
     units: Mapping[str, str] = field(default_factory=dict)
+    usual_units: Mapping[str, str] = field(default_factory=dict)
     no_leader: str | None = None
     hold: float | None = None
     skip_bad: int = SKIPPED
@@ -892,7 +895,8 @@ class _Reader:
         is_dated = clock and (form or tables.is_date(" ".join(map(table.first, clock))))
         numbers = [*self._observed, columns.action, *(t.column for t in self._terms if t.of_number)]
         numbers = [*dict.fromkeys([*numbers, *([] if is_dated else clock)])]
-        units = {name: unit for name in numbers if (unit := table.units.get(name))}
+        usual = columns.usual_units if isinstance(table, tables.CsvTable) else {}
+        units = {name: unit for name in numbers if (unit := {**usual, **table.units}.get(name))}
         of_options = {name: unit for name, unit in columns.units.items() if unit != form}
         try:
             units |= units_of(of_options, numbers)

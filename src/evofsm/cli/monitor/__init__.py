@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack, nullcontext
+from dataclasses import replace
 from functools import partial
 from hashlib import sha256
 from itertools import chain
@@ -167,7 +168,7 @@ def monitor(
                 observe = options.quoted(names)
             if alone:
                 reader["action"] = ""
-            log_format = options.reading_of(**reader, observe=observe)
+            log_format = replace(options.reading_of(**reader, observe=observe), usual_units=units)
             fewest = 1 if alone else 2  # a failure that comes at once counts as well
             notes = Noted()
             episodes = episodes_read(str(file), log_format, notes, dated=alone, fewest=fewest)
@@ -208,13 +209,14 @@ def monitor(
         if not (is_log or traffic):
             if observe is None or sentry.variables != VARIABLES:  # cars' may have other names
                 observe = options.quoted(sentry.variables or VARIABLES)
-            slots = Slots(options.reading_of(**{**reader, "observe": observe, "dt": None}), units)
+            row_format = options.reading_of(**{**reader, "observe": observe, "dt": None})
+            slots = Slots(replace(row_format, usual_units=units))
         decider = Decider(sentry, episode=rows, slots=slots)
         stack.callback(decider.close)
         if slots is not None and reader:
             si = "; in JSON all but its column of the time is in the SI" * ("unit" in reader)
             notice += f"; rows are read as in a log: {options.typed(reader)}{si}"
-        if units and slots is not None:
+        if units:
             texts = ", ".join(f"{name} in {unit}" for name, unit in units.items())
             notice += f"; CSV has {texts} as in the guard's log, unless a row of units says others"
         if summary and file is not None:

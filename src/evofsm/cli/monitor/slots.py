@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from hashlib import sha256
 from itertools import zip_longest
 from operator import itemgetter
@@ -22,11 +22,8 @@ _BECOME: dict[str, Any] = {"mean": fmean, "last": itemgetter(-1), "max": max, "m
 class Slots:
     """Puts rows of a step together; those that wait are one when a row of another step comes."""
 
-    def __init__(
-        self, columns: LogColumns | None = None, units: Mapping[str, str] | None = None
-    ) -> None:
+    def __init__(self, columns: LogColumns | None = None) -> None:
         self.columns = columns = columns or LogColumns()
-        self.units = units or {}  #: of columns of CSV, where neither it nor an option tells them
         #: [s], 0 where rows stay as they are; and what the values of a column become.
         self.step, self._how = columns.resample or Resample(0.0)
         self.hole = columns.longest_hole  #: up to which a hole costs no episode [s]
@@ -125,7 +122,7 @@ class CsvRows:
 
     def __init__(self, slots: Slots, variables: Sequence[str], *, acts: bool) -> None:
         self._columns = columns = slots.columns
-        self._usual_units, actions = slots.units, [columns.action, "proposal"] * acts
+        actions = [columns.action, "proposal"] * acts
         self._variables = slots.names[: len(variables)]
         self._numbers = {*self._variables, *actions, *slots.compared}
         if "%" not in columns.units.get(columns.time, ""):
@@ -217,7 +214,7 @@ class CsvRows:
             return True
         numbers = [name for name in dialect.columns if name in self._numbers]
         units = {name: unit for name, unit in self._columns.units.items() if "%" not in unit}
-        units = {**self._usual_units, **dialect.units, **units_of(units, numbers)}
+        units = {**self._columns.usual_units, **dialect.units, **units_of(units, numbers)}
         self._factors = {name: tables.UNITS.get(units.get(name, ""), 1.0) for name in numbers}
         self._dialect = dialect
         return dialect.n_told == len(below)

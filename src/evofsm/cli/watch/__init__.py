@@ -6,6 +6,7 @@ import asyncio
 import re
 import webbrowser
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from shlex import quote
 from typing import Annotated, Any
@@ -75,7 +76,8 @@ def watch(
             failed = reader.get("failed")
             log_guard = None if guard is None else load_learning(guard, failed)
             try:
-                log_format = options.reading_of(**reader)
+                units = options.read_with(guard, "units")
+                log_format = replace(options.reading_of(**reader), usual_units=units)
                 is_simulation = what.endswith(options.SUMO)
                 show = session.watched_simulation if is_simulation else session.watched_log
                 run = show(what, log_format, risk, case, log_guard, brakes=brakes)
