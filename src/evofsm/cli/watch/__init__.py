@@ -73,8 +73,7 @@ def watch(
         if is_log:
             risk = None if tolerance == options.TOLERANCE else tolerance
             reader = {**options.read_with(guard), **reading}
-            failed = reader.get("failed")
-            log_guard = None if guard is None else load_learning(guard, failed)
+            log_guard = None if guard is None else load_learning(guard, reader.get("failed"))
             try:
                 units = options.read_with(guard, "units")
                 log_format = replace(options.reading_of(**reader), usual_units=units)
