@@ -128,8 +128,8 @@ def passed(proposal: Proposal, usable: Usable, reviser: Reviser) -> Usable:
     if not can_pass or getattr(reviser, "mode", Mode.ACT) is Mode.ACT:
         return usable
     is_barred = same_action(put_into(reviser.actions, proposal.action), proposal.action)
-    barred = f"proposal {action_text(proposal.action)} is not allowed here"
-    return Usable(fixed(proposal.action), barred if is_barred else usable.remark)
+    remark = f"proposal {action_text(proposal.action)} is not allowed here"
+    return Usable(fixed(proposal.action), remark if is_barred else usable.remark)
 
 
 class ActionReviser:

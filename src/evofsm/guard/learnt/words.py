@@ -200,10 +200,10 @@ def _where(table: Floats, names: Sequence[str]) -> tuple[str, list[str], list[st
     places: dict[int, list[str]] = {FAILS: [], ENDS: [], CRASHES: [], FATAL: []}
     sides = []
     for row, is_side in zip(table, failure.are_sides(table), strict=True):
-        place, count, what = row[I:HELD].tolist(), int(row[HELD]), _WHAT[int(row[SAYS])]
-        text = region(names, place, count, what)
+        place, count, kind = row[I:HELD].tolist(), int(row[HELD]), _WHAT[int(row[SAYS])]
+        text = region(names, place, count, kind)
         if is_side and row[SAYS] == FAILS:
-            sides.append(text.removeprefix("where ").removesuffix(f" ({counted(count, what)})"))
+            sides.append(text.removeprefix("where ").removesuffix(f" ({counted(count, kind)})"))
         else:
             places[int(row[SAYS])].append(text)
     there = [" or ".join([f"where {' or '.join(sides)}"] * bool(sides) + places[FAILS])]
