@@ -125,14 +125,13 @@ static int survives(const double here[3], double acceleration, double before, do
   }
   for (t = 0; t < 2 && gap > 0.0 && !(asked == caution && last == caution); t++) {
     const double mean = LAG * last + (1.0 - LAG) * asked, gain = -leader_decel - mean;
-    double driven;
     closing = speed - leader;
     if (closing > 0.0 && closing < gain * EVOFSM_INTERVAL &&
         leader * gain > leader_decel * closing && gap <= 0.5 * closing * closing / gain) {
       return 0;
     }
-    driven = drive_on(&speed, mean, EVOFSM_INTERVAL);
-    gap += drive_on(&leader, -leader_decel, EVOFSM_INTERVAL) - driven;
+    gap += drive_on(&leader, -leader_decel, EVOFSM_INTERVAL) -
+           drive_on(&speed, mean, EVOFSM_INTERVAL);
     last = asked;
     asked = caution;
   }
@@ -153,11 +152,9 @@ static double critical_of(const double here[3], double acceleration, double befo
   }
   for (i = 0; i < HALVINGS; i++) {
     const double between = 0.5 * (low + high);
-    if (survives(here, acceleration, before, between, CLEARANCE)) {
-      low = between;
-    } else {
-      high = between;
-    }
+    const int is_survived = survives(here, acceleration, before, between, CLEARANCE);
+    low = is_survived ? between : low;
+    high = is_survived ? high : between;
   }
   return low;
 }
@@ -195,11 +192,8 @@ static double harder_than(double x) {
   }
   while (high - low > 1) {
     const int between = (low + high) / 2;
-    if (harder[0][between] <= x) {
-      low = between;
-    } else {
-      high = between;
-    }
+    low = harder[0][between] <= x ? between : low;
+    high = harder[0][between] <= x ? high : between;
   }
   return (harder[1][high] - harder[1][low]) / (harder[0][high] - harder[0][low]) *
              (x - harder[0][low]) + harder[1][low];

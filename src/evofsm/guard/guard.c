@@ -198,9 +198,8 @@ static void recognise(evofsm_state *s) {
       s->seen = time_seen[i];
     }
   }
-  if (s->state >= 0 && smallest > STATE_REACH * STATE_REACH) {
-    s->seen = 0.0; /* as far as the states tell */
-  }
+  /* As far as the states tell. */
+  s->seen = s->state >= 0 && smallest > STATE_REACH * STATE_REACH ? 0.0 : s->seen;
 #endif
 }
 
@@ -216,11 +215,8 @@ static int take(evofsm_state *s, const double observation[EVOFSM_VARIABLES], dou
   }
   for (j = 0; j < EVOFSM_VARIABLES; j++) {
     s->observation[j] = stands ? NAN : observation[j];
-    if (isnan(s->observation[j])) {
-      found |= EVOFSM_PARTIAL;
-    } else {
-      s->held[j] = observation[j];
-    }
+    found |= isnan(s->observation[j]) ? EVOFSM_PARTIAL : 0;
+    s->held[j] = isnan(s->observation[j]) ? s->held[j] : observation[j];
   }
   s->time = time;
   return found;
@@ -230,11 +226,8 @@ static int take(evofsm_state *s, const double observation[EVOFSM_VARIABLES], dou
 static int make_usable(evofsm_state *s, const double proposal[EVOFSM_ACTIONS]) {
   int i, is_usable = 1, remark = EVOFSM_AS_PROPOSED;
   for (i = 0; i < EVOFSM_ACTIONS; i++) {
-    is_usable &= isfinite(proposal[i]) != 0;
-    if (EVOFSM_CHOICES > 0) {
-      is_usable &= proposal[i] >= 0.0 && proposal[i] <= EVOFSM_CHOICES - 1.0;
-      is_usable &= floor(proposal[i]) == proposal[i];
-    }
+    const int is_choice = proposal[i] <= EVOFSM_CHOICES - 1.0 && floor(proposal[i]) == proposal[i];
+    is_usable &= isfinite(proposal[i]) && (EVOFSM_CHOICES == 0 || (proposal[i] >= 0.0 && is_choice));
   }
   for (i = 0; i < EVOFSM_ACTIONS; i++) {
     const double within = lesser(greater(proposal[i], action_low[i]), action_high[i]);
@@ -302,12 +295,12 @@ int evofsm_decide_at(evofsm_state *state, const double observation[EVOFSM_VARIAB
   out->is_new = out->seen < NEW;
   memcpy(out->advised, state->best, sizeof out->advised);
   memcpy(out->executed, ACTS ? state->best : state->proposal, sizeof out->executed);
+  if (!ACTS && out->remark == EVOFSM_OUTSIDE) {
+    memcpy(out->executed, proposal, sizeof out->executed); /* who does not act changes nothing */
+  }
   state->decisions += 1.0;
   if ((intake & (EVOFSM_REPEATED | EVOFSM_LATE)) == 0) {
     follow(state, out->executed);
-  }
-  if (!ACTS && out->remark == EVOFSM_OUTSIDE) {
-    memcpy(out->executed, proposal, sizeof out->executed); /* who does not act changes nothing */
   }
   return EVOFSM_OK;
 }
