@@ -68,6 +68,10 @@ def test_help_loads_nothing_heavy(command):
     [
         (["nosuch"], "No such command 'nosuch'"),
         (["check"], "Missing argument 'name'"),
+        (["check", "evofsm"], "names nothing; write module:Name"),
+        (["check", "evofsm.fsm.rules:Calm"], "has no attribute 'Calm'"),
+        (["check", "not_there:Calm"], "is it in this folder, or installed?"),
+        (["check", "evofsm.guard:Proposal"], "has the methods of no kind"),
         (["inspect", "x", "--colour", "red"], "No such option: --colour"),
         (["drive", "paper", "--episodes", "0"], "Invalid value for '--episodes'"),
         (["drive", "paper", "--world", "moon"], "'moon' is not one of 'sumo', 'kinematic'"),
@@ -98,43 +102,17 @@ def test_what_programs_are_told_is_strict_json(evofsm):
     assert driven["episodes"] == 2
 
 
-# -- `evofsm check` --------------------------------------------------------------------------------
-
-MODULE = """
-from evofsm.guard import Proposal
-
-class Confused:
-    def propose(self, observation, time=0.0):
-        return Proposal(float("nan"))
-"""
-
-
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """A folder with a module of one's own."""
-    (tmp_path / "own_driver.py").write_text(MODULE)
+def test_check_ends_with_1_and_says_what_is_wrong(evofsm, tmp_path, monkeypatch):
+    (tmp_path / "own_driver.py").write_text(
+        "from evofsm.guard import Proposal\nclass Confused:\n"
+        "    def propose(self, observation, time=0.0):\n        return Proposal(float('nan'))\n"
+    )
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.delitem(sys.modules, "own_driver", raising=False)
-
-
-def test_it_ends_with_1_and_says_what_is_wrong(evofsm, folder):
     result = evofsm("check", "own_driver:Confused", "--json")
     assert result.exit_code == 1
     assert '"passed": false' in result.output
     assert "it proposes nan at gap" in result.output
     result = evofsm("check", "own_driver:Confused")
     assert max(map(len, result.output.splitlines())) <= 80
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["own_driver"], "names nothing; write module:Name"),
-        (["own_driver:Calm"], "has no attribute 'Calm'"),
-        (["not_there:Calm"], "is it in this folder, or installed?"),
-        (["own_driver:Proposal"], "has the methods of no kind"),
-    ],
-)
-def test_what_cannot_be_checked_is_refused_in_one_line(refused, folder, arguments, message):
-    assert message in refused("check", *arguments)
