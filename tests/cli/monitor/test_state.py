@@ -15,17 +15,13 @@ from evofsm.io.logs import Resample
 from monitor_rows import JUNK, line, scenes, traffic
 
 
-def abandoned(state):
-    """As the death of the process leaves it: nothing is written, the lock is gone."""
-    state._journal._file.close()
-
-
 @pytest.fixture
 def opened(tmp_path):
-    """Opens a state as a monitor does; in the end all are abandoned."""
+    """Opens a state as a monitor does, where the one before was killed; so is the last one."""
     states = []
 
     def open_state(path=tmp_path / "state.evofsm", learn=True, fresh=made, **settings):
+        abandon()
         states.append(state := State(path, {"learn": True, "guard": None}))
         try:
             guard = state.guard(fresh)
@@ -37,9 +33,13 @@ def opened(tmp_path):
         state.begin(decider)
         return decider, state
 
+    def abandon():
+        """As the death of the process leaves it: nothing is written, the lock is gone."""
+        for state in states:
+            state._journal._file.close()
+
     yield open_state
-    for state in states:
-        abandoned(state)
+    abandon()
 
 
 def slotted():
@@ -60,11 +60,10 @@ def slotted():
 def test_it_goes_on_bit_for_bit_wherever_it_is_killed(opened, learn, mode, settings):
     plain = Decider(made(learn, mode), **{"episode": 700, **settings()})
     told = {"learn": learn, "fresh": lambda: made(learn, mode)}
-    (decider, state), kinds = opened(**told, **settings()), set()
+    (decider, _), kinds = opened(**told, **settings()), set()
     for k, row in enumerate(traffic(1600)):
         if k in (3, 4, 601, 690, 701, 1399, 1400, 1402, 1403):
-            abandoned(state)
-            decider, state = opened(**told, **settings())
+            decider, _ = opened(**told, **settings())
         if k % 50 == 0:
             assert decider.answer(JUNK[k // 50 % len(JUNK)])["kind"] == "error"
         answer = decider.answer(line(row))
@@ -108,7 +107,6 @@ def test_a_journal_or_a_guard_that_was_lost_emptied_or_changed_is_said(tmp_path,
         journal.write_bytes(whole[:end])
         decider, state = opened(path)
         assert decider.n == known
-        abandoned(state)
 
 
 @pytest.mark.parametrize("is_saved", [False, True])
@@ -120,7 +118,6 @@ def test_killed_as_the_guard_is_saved_it_goes_on(opened, is_saved, monkeypatch):
     monkeypatch.setattr(*last, Mock(side_effect=SystemExit))
     with pytest.raises(SystemExit):
         any(decider.answer(row) is None for row in rows)
-    abandoned(state)
     decider, state = opened()
     assert [decider.answer(row) for row in rows[699:]] == expected[699:]
 
@@ -129,12 +126,11 @@ def test_rows_in_flight_across_an_end_are_decided_once_though_it_is_killed(opene
     rows = [line(row) for row in traffic(720)]
     messages = [*rows[:700], b'{"end": true, "failed": true}', *rows[700:]]
     expected = answers_to(messages)
-    decider, state = opened()
+    decider, _ = opened()
     for lost in (5, 695, 699, 702):  # the guard is written with message 700
         for message in messages[max(0, lost - 9) : lost + 9]:
             decider.answer(message)
-        abandoned(state)
-        decider, state = opened()
+        decider, _ = opened()
         assert [decider.answer(m) for m in messages[lost : lost + 9]] == expected[lost : lost + 9]
         for message in messages[lost + 9 : 690]:
             decider.answer(message)
@@ -144,7 +140,7 @@ def test_rows_that_a_sender_does_not_wait_with_are_decided_once_though_it_is_kil
     rows = [line(row) for row in traffic(620)]
     answers, expected = [], msgspec.json.decode(msgspec.json.encode(answers_to(rows)))
     for count in (400, 619, 999):  # with so many it is killed, before the last is answered
-        decider, state = opened()
+        decider, _ = opened()
         keep, pieces = decider.keep, iter([b"".join(row + b"\n" for row in rows[len(answers) :])])
 
         def kept(told, keep=keep, decider=decider, count=count):
@@ -158,30 +154,27 @@ def test_rows_that_a_sender_does_not_wait_with_are_decided_once_though_it_is_kil
                 lambda _, pieces=pieces: next(pieces, b""),
                 lambda data: answers.extend(map(msgspec.json.decode, data.splitlines())),
             )
-        abandoned(state)
     assert answers == expected
     assert decider.n == 620
 
 
 def test_a_refused_end_stops_no_restart(opened):
-    decider, state = opened(fresh=lambda: Guard(n_actions=2, interval=0.1))
+    decider, _ = opened(fresh=lambda: Guard(n_actions=2, interval=0.1))
     for k, seen in enumerate(("[3.4e38]", "[1, 2, 3]", "[1e100, 1]", "[null]")):
         row = {"time": 0.1 * k, "observation": [1.0, 2.0], "proposal": 0}
         assert decider.answer(line(row))["kind"] == "decision"
         end = f'{{"end": true, "failed": true, "observation": {seen}}}'
         assert decider.answer(end.encode())["kind"] == "error"
-        abandoned(state)
-        decider, state = opened()
+        decider, _ = opened()
         assert (decider.n, decider.rows) == (k + 1, k + 1)
 
 
 def test_what_cannot_be_taken_in_again_is_left_out_and_said(opened, monkeypatch, caplog):
-    decider, state = opened()
+    decider, _ = opened()
     for message in [*(line(row) for row in traffic(3)), b'{"end": true}']:
         decider.answer(message)
-    abandoned(state)
     monkeypatch.setattr(Guard, "end", Mock(side_effect=RuntimeError("another version")))
-    decider, state = opened()
+    decider, _ = opened()
     assert (decider.n, decider.rows) == (3, 3)
     assert "a message is left out: another version" in caplog.text
 
@@ -192,7 +185,7 @@ def test_two_monitors_do_not_keep_themselves_in_one_place(tmp_path, opened):
     (tmp_path / "elsewhere" / "link.evofsm").symlink_to(tmp_path / "state.evofsm")
     for path in (tmp_path / "state.evofsm", tmp_path / "elsewhere" / "link.evofsm"):
         with pytest.raises(ValueError, match="is being written by another process"):
-            opened(path)
+            State(path, {})
 
 
 def test_where_it_can_not_be_kept_it_goes_on_says_so_and_keeps_it_later(opened, monkeypatch):
@@ -207,6 +200,7 @@ def test_where_it_can_not_be_kept_it_goes_on_says_so_and_keeps_it_later(opened, 
     decider.answer(rows[2])
     with pytest.raises(OSError, match="No space left on device; what came since then is lost"):
         state.close()
+    assert state._journal._file.closed
     decider, state = opened()
     assert decider.n == 0
     with monkeypatch.context() as patched:
@@ -217,7 +211,6 @@ def test_where_it_can_not_be_kept_it_goes_on_says_so_and_keeps_it_later(opened, 
     decider.answer(b'{"end": true, "failed": true}')
     assert not state.failure
     decider.answer(rows[2])
-    abandoned(state)
     decider, state = opened()
     assert (decider.n, decider.rows, decider.guard.n_failed) == (3, 1, 1)
 
@@ -225,6 +218,5 @@ def test_where_it_can_not_be_kept_it_goes_on_says_so_and_keeps_it_later(opened, 
 def test_scenes_and_ends_are_kept(opened):
     messages = [*scenes(5), b'{"end": true}', *scenes(9)][:12]
     for message, expected in zip(messages, answers_to(messages), strict=True):
-        decider, state = opened()
+        decider, _ = opened()
         assert decider.answer(message) == expected
-        abandoned(state)
