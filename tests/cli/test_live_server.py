@@ -155,13 +155,11 @@ def test_who_comes_late_is_shown_all_of_it(page):
     assert {"clock", "graph"} <= set(kinds)
 
 
-ACTS = {"revise": ("revising", False), "speed": ("speed", 8), "pause": ("paused", False)}
-
-
 def test_pages_act_on_the_run(page):
+    acts = {"revise": ("revising", False), "speed": ("speed", 8), "pause": ("paused", False)}
     with looking_on(page) as client:
         told(client, "clock")
-        for command, (name, value) in ACTS.items():
+        for command, (name, value) in acts.items():
             client.send(json.dumps({"do": command, "value": value}))
             assert told(client, "clock")[name] == value
         client.send('{"do": "case", "value": 3}')

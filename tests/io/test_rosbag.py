@@ -201,17 +201,15 @@ def test_what_has_a_name_in_a_message_is_known_by_it(tmp_path):
         ]
         messages += [(0.1 * k, "/joints", state), (0.1 * k, "/tf", transforms(there))]
     path = write(tmp_path / "bag", messages)
-    for gap in ("/joints.position[0]", "/joints.position[gap]", TF.format("0"), TF.format("gap")):
+    frame = "/tf.transforms[{}].transform.translation.x".format
+    for gap in ("/joints.position[0]", "/joints.position[gap]", frame("0"), frame("gap")):
         told = {"gap": gap, "v_follower": gap.replace("gap", "own").replace("[0]", "[1]")}
-        (chunk,) = read(path, {"variables": told | {"v_leader": TF.format("own")}})
+        (chunk,) = read(path, {"variables": told | {"v_leader": frame("own")}})
         held = [k - (k % 3 == 2) for k in range(40)]
         assert chunk.observations[:, 0].tolist() == held
         assert (chunk.observations[:, 1:] == 100.0).all()
     with pytest.raises(ValueError, match=r"no messages with /joints.position\[foot\]"):
         read(path, {"variables": dict.fromkeys(TOLD["variables"], "/joints.position[foot]")})
-
-
-TF = "/tf.transforms[{}].transform.translation.x"
 
 
 def test_of_mcap_that_ends_early_the_beginning_is_read(tmp_path):
