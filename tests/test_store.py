@@ -164,10 +164,6 @@ def header_with(**others):
     return lambda told, entries, _: told.update(others)
 
 
-def settings_with(**others):
-    return lambda told, entries, _: told["settings"].update(others)
-
-
 def array_with(name, **others):
     return lambda told, entries, _: entries[name].update(others)
 
@@ -193,11 +189,11 @@ HARMFUL = {
         lambda told, entries, _: entries.update({"\x1b[2J": entries.pop("note")}),
         r"it has \\x1b\[2J, which no draws has",
     ),
-    "null": (settings_with(n_kinds=None), "lacks n_kinds"),
-    "negative": (settings_with(n_kinds=-1), "n_kinds of -1 cannot be right"),
-    "a float": (settings_with(n_kinds=2.0), "n_kinds holds a fraction; it must be an integer"),
-    "none of two types": (settings_with(name=[]), r"name is \[\]; it must be of type str | None"),
-    "text": (settings_with(scale="wide"), "scale is 'wide'; it must be a number"),
+    "null": ({"n_kinds": None}, "lacks n_kinds"),
+    "negative": ({"n_kinds": -1}, "n_kinds of -1 cannot be right"),
+    "a float": ({"n_kinds": 2.0}, "n_kinds holds a fraction; it must be an integer"),
+    "none of two types": ({"name": []}, r"name is \[\]; it must be of type str | None"),
+    "text": ({"scale": "wide"}, "scale is 'wide'; it must be a number"),
     "a lost array": (lambda told, entries, _: entries.pop("note"), "none that evofsm writes"),
     "an unknown type": (array_with("values", dtype="F32"), "none that evofsm writes"),
     "too large": (array_with("values", shape=[1 << 60, 2]), "none that evofsm writes"),
