@@ -35,10 +35,6 @@ EPISODES = st.lists(ROWS, min_size=1, max_size=8).map(np.array)
 AT_EQUAL_SPEED = np.array([[10.0, 24.0, 24.0]])
 
 
-def last_score(measure, episode):
-    return measure.score(episode, DT)[-1]
-
-
 @pytest.mark.slow
 @EVERY_MEASURE
 @given(EPISODES, st.data())
@@ -69,7 +65,7 @@ def test_closer_faster_or_behind_a_slower_leader_is_not_safer(measure, episode, 
     worse = episode.copy()
     worse[-1, column] += sign * much
     if column != 2 or worse[-1, 2] >= 0.0:
-        larger, smaller = last_score(measure, worse), last_score(measure, episode)
+        larger, smaller = (measure.score(rows, DT)[-1] for rows in (worse, episode))
         assert larger >= smaller or np.isclose(larger, smaller, rtol=1e-9, atol=1e-9)
 
 
