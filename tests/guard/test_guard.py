@@ -1,6 +1,5 @@
 """One object for any system: it decides, learns, is frozen, and is kept in a file."""
 
-import io
 import math
 import sys
 import threading
@@ -298,15 +297,13 @@ def test_a_copy_goes_its_own_way(make, snapshot):
 # -- What is kept -------------------------------------------------------------------------------
 
 
-def test_what_was_saved_goes_on_bit_for_bit(make, snapshot):
-    guard, file = make(tolerance=0.05, mode=Mode.SHADOW), io.BytesIO()
+def test_what_was_saved_goes_on_bit_for_bit(make, snapshot, tmp_path):
+    guard, path = make(tolerance=0.05, mode=Mode.SHADOW), tmp_path / "guard"
     balance(guard, pushes(make, 20))
     guard.decide([0.1, 0.0], SMALL[make])  # what is under way is not kept
-    guard.save(file, {"roads": 3})
-    file.seek(0)
-    assert store.read_header(file).provenance == {"roads": 3}
-    file.seek(0)
-    again = Guard.load(file, judge=type(guard.judge))
+    guard.save(path, {"roads": 3})
+    assert store.read_header(path).provenance == {"roads": 3}
+    again = Guard.load(path, judge=type(guard.judge))
     guard.begin()
     assert (again.reviser.tolerance, again.reviser.mode) == (0.05, Mode.SHADOW)
     assert (again.interval, again.actions) == (guard.interval, guard.actions)
@@ -452,13 +449,10 @@ def test_settings_of_the_reviser_are_looked_at_where_they_are_set():
         unrevised.mode = "shadow"
 
 
-def test_a_reviser_for_decisions_at_another_interval_is_refused():
+def test_a_reviser_for_another_interval_and_a_machine_of_other_actions_are_refused():
     reviser = EnvelopeReviser(ModifiedTimeToCollision(), IntervalActions(-2.5, 2.5, 0.3), 0.25)
     with pytest.raises(ValueError, match=r"is 0\.1 s, but the reviser was made for .* 0\.25 s"):
         Guard.of(reviser, interval=0.1)
-
-
-def test_a_machine_of_other_actions_is_refused():
     with pytest.raises(ValueError, match="the machine has 4 actions, but the set has 17"):
         guard_for_cars(-2.5, 2.5, machine=EvolvingFSM(4))
 
