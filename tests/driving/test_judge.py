@@ -304,7 +304,7 @@ def test_a_risk_that_no_drive_could_have_left_is_refused(forge, tmp_path, name, 
         LatentRisk.load(tmp_path / "risk")
 
 
-def test_a_risk_that_saw_jumps_and_odd_numbers_is_kept_and_read_again(tmp_path):
+def test_a_risk_that_saw_jumps_and_odd_numbers_is_kept_and_read_again(snapshot, reloaded):
     random = np.random.default_rng(0)
     odd = (0.0, 1e-9, 1.0, 30.0, 200.0, 1e9, 1e100, np.nan)
     for dt in (0.01, 0.25, 10.0):
@@ -313,9 +313,7 @@ def test_a_risk_that_saw_jumps_and_odd_numbers_is_kept_and_read_again(tmp_path):
             risk.learn(random.choice(odd, 3), random.choice([-2.5, 1.0, -1e100, 1e100]))
             if turn % 100 == 0:
                 risk.end(None, failed=False)
-        risk.save(tmp_path / "risk")
-        LatentRisk.load(tmp_path / "risk").save(tmp_path / "again")
-        assert (tmp_path / "again").read_bytes() == (tmp_path / "risk").read_bytes()
+        assert snapshot(reloaded(risk)) == snapshot(risk)
 
 
 # -- By state ---------------------------------------------------------------------------------

@@ -93,7 +93,7 @@ def test_a_controller_that_fails_once_is_driven_on_without(line, caplog):
     assert "no usable proposal" in told.decisions[2].revision.reason
 
 
-def test_a_driver_who_brakes_hard_shows_what_the_brakes_can_do(tmp_path):
+def test_a_driver_who_brakes_hard_shows_what_the_brakes_can_do(reloaded):
     risk = LatentRisk(-8.0, dt=0.1)
     reviser = ActionReviser(risk, IntervalActions(-8.0, 2.0, 0.5), mode=Mode.SHADOW)
 
@@ -108,8 +108,7 @@ def test_a_driver_who_brakes_hard_shows_what_the_brakes_can_do(tmp_path):
     assert braked(3.0) == pytest.approx(4.8)  # what was never shown stays as assumed
     assert braked(6.0) == pytest.approx(6.0)
     assert braked(2.0) == pytest.approx(6.0)
-    risk.save(tmp_path / "risk.evofsm")
-    assert LatentRisk.load(tmp_path / "risk.evofsm").brakes.decel == pytest.approx(6.0)
+    assert reloaded(risk).brakes.decel == pytest.approx(6.0)
     reviser.mode = Mode.ACT
     assert braked(7.0) == pytest.approx(6.0)  # its own braking is told from what it commands
 

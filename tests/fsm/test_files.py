@@ -25,12 +25,10 @@ SITUATIONS = {
 
 
 @pytest.mark.parametrize("situation", SITUATIONS.values(), ids=SITUATIONS.keys())
-def test_a_loaded_machine_goes_on_bit_for_bit(situation, grown, snapshot, tmp_path):
+def test_a_loaded_machine_goes_on_bit_for_bit(situation, grown, snapshot, reloaded):
     new = situation(grown)
     machine = new if isinstance(new, EvolvingFSM) else grown
-    twin = machine.copy()
-    machine.save(tmp_path / "machine")
-    loaded = EvolvingFSM.load(tmp_path / "machine")
+    twin, loaded = machine.copy(), reloaded(machine)
     assert repr(loaded) == repr(machine)
     Z, I = np.random.default_rng(5).normal(size=(100, 2)), np.arange(100) % 3
     traces = [m.learn_many(Z, I, belief=True) for m in (machine, loaded, twin)]
@@ -48,10 +46,9 @@ def novel_model(grown):
 @pytest.mark.parametrize(
     "make", [full_model, novel_model, EvolvingFSM.model, lambda _: EvolvingFSM(2).model()]
 )
-def test_a_loaded_model_has_every_field_of_the_saved_one(make, grown, tmp_path):
+def test_a_loaded_model_has_every_field_of_the_saved_one(make, grown, reloaded):
     model = make(grown)
-    model.save(tmp_path / "model")
-    loaded = FSMModel.load(tmp_path / "model")
+    loaded = reloaded(model)
     for field in fields(FSMModel):
         value, expected = getattr(loaded, field.name), getattr(model, field.name)
         if isinstance(expected, np.ndarray):
@@ -62,7 +59,7 @@ def test_a_loaded_model_has_every_field_of_the_saved_one(make, grown, tmp_path):
             assert type(value) is type(expected) or field.name == "width"
 
 
-def test_numbers_of_every_size_are_kept_and_read_again(snapshot, tmp_path):
+def test_numbers_of_every_size_are_kept_and_read_again(snapshot, reloaded):
     """What can be learnt can be kept: whatever the observations, the rule, and who is given up."""
     random = np.random.default_rng(0)
     sizes = (0.0, 5e-324, 1e-200, 1e-9, 1.0, 1e9, 1e100)
@@ -78,10 +75,8 @@ def test_numbers_of_every_size_are_kept_and_read_again(snapshot, tmp_path):
         for _ in range(2):
             Z = random.choice(sizes, (60, 2)) * random.uniform(-1.0, 1.0, (60, 2))
             machine.learn_many(Z, random.integers(-1, 2, 60), [7, 31], failures=[6, 59])
-            machine.save(tmp_path / "machine")
-            assert snapshot(EvolvingFSM.load(tmp_path / "machine")) == snapshot(machine)
-            machine.model().save(tmp_path / "model")
-            FSMModel.load(tmp_path / "model")
+            for one in (machine, machine.model()):
+                assert snapshot(reloaded(one)) == snapshot(one)
 
 
 MACHINES = [
