@@ -25,6 +25,7 @@ from evofsm.fsm.proportions import outward, poisson_bounds
 from evofsm.fsm.rules import describe_rule, rule_named
 from evofsm.fsm.validation import counted, positive
 from evofsm.guard import ActionReviser, Foresight, Guard, LearntRisk, Mode
+from evofsm.guard.actions import limits
 from evofsm.guard.foresight import span
 from evofsm.io import Chunk, LogColumns, episodes_of, read_traces
 from evofsm.io.logs import Noted
@@ -229,7 +230,10 @@ def teach(guard: Guard, chunks: Iterable[Chunk], show: Callable[[int], object]) 
     assert isinstance(reviser, ActionReviser)
     for episode in episodes_of(chunks):
         rows, times = episode.observations, episode.times - episode.times[0]
-        for row, proposal, at in zip(rows[:-1], episode.actions, times, strict=False):
+        actions = episode.actions
+        if isinstance(guard.judge, LearntRisk):  # what lies beyond is at an end, as for states
+            actions = np.clip(actions, *limits(guard.actions))
+        for row, proposal, at in zip(rows[:-1], actions, times, strict=False):
             guard.decide(row, proposal, at)
             refusals.append(reviser.refuses)
         guard.end(episode.failed, rows[-1])  # with its last row

@@ -545,7 +545,8 @@ class Foresight(LearningJudge):
     def _region(self, form: Floats) -> str:
         """Where a form is, in words."""
         row = form[failure.I : failure.HELD].tolist()
-        return region(self.labels.names, row, 0).rpartition(" (")[0].removeprefix("where ")
+        text = region(self.labels.names, row, 1)
+        return text.removeprefix("where ").removesuffix(" (1 failure)")
 
     @property
     def told_by_experience(self) -> str:
