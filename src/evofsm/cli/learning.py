@@ -147,20 +147,23 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
         cause = f"is the time in {unit}? --unit {time}={unit} converts it"
         warnings.append(f"there is a row every {step:,.6g} s: {cause}")
     nobody = " (no leader)" * cars
-    question = f"a missing value{nobody}? --no-leader {{}} leaves such rows out".format
+
+    def missing(condition: str) -> str:
+        return f"a missing value{nobody}? --no-leader {quote(condition)} leaves such rows out"
+
     share = f"{noted.failed_at_once:,} of {noted.failed:,}"
     constant = [kv for kv in noted.at_once.items() if kv[1] in _NOBODY or noted.failed_at_once > 1]
     if constant and noted.failed_at_once >= noted.failed / 2:
         name, value = min(constant, key=lambda kv: kv[1] not in _NOBODY)
         fault = f"fail with their first row, and {name} is {value:g} there each time"
-        hint = f"does that stand for {question(quote(f'{name}=={value:g}'))}"
+        hint = f"does that stand for {missing(f'{name}=={value:g}')}"
         warnings.append(f"{share} failed episodes {fault}: {hint}")
     if noted.failed_at_once:
         why = "what led there was not recorded, so no alarm could foresee them"
         warnings.append(f"{share} failures came right after a hole or standstill: {why}")
     if alone := [(name, *pair) for name, pair in noted.below.items() if pair[0] and pair[1] > 2]:
         name, value, rows = min(alone, key=lambda entry: entry[1] not in _NOBODY)
-        hint = f"is that {question(quote(f'{name}=={value!r}'))}"
+        hint = f"is that {missing(f'{name}=={value!r}')}"
         warnings.append(f"{name} is {value!r} in {rows:,} rows, apart from all others: {hint}")
     warnings += _contradictions(noted, columns)
     if noted.unplaced:
