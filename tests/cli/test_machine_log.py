@@ -399,7 +399,7 @@ def test_rows_that_come_live_become_what_they_were_in_the_log(evofsm, written, p
     found = [a.get("last", a) if a.get("failed", True) else a for a in answers]
     found = [one for one in found if one["kind"] == "decision"]
     # As the log is read: by the options that are in the guard's file.
-    told = read_with(Path("guard.evofsm"))
+    told, _ = read_with(Path("guard.evofsm"))
     chunks = read_traces([path], reading_of(**told))
     decider = Decider(Guard.load("guard.evofsm"), slots=Slots(LogColumns(hole=300.0)))
     expected = [a for a, row in decided_on_log(decider, episodes_of(chunks)) if row is not None]
@@ -472,7 +472,7 @@ def test_a_guard_from_zero_of_who_acts_learns_what_fails(evofsm, acts):
 def test_a_log_of_any_machine_is_watched(evofsm, written):
     path, asked = written("parquet"), (*BOTH, "--time", "Zeit", "--resample", "20s")
     assert evofsm("learn", path, *asked, "--guard", "guard.evofsm").exit_code == 0
-    reading = reading_of(**read_with(Path("guard.evofsm")))
+    reading = reading_of(**read_with(Path("guard.evofsm"))[0])
     with watched_log(path, reading, guard=Guard.load("guard.evofsm")) as shown:
         first, second, *_, last = shown.start.cases
         assert first == "episode 1, 2025-03-10 06:00:20 (alarm, failure)"

@@ -251,13 +251,14 @@ def reading_of(
     )
 
 
-def read_with(learnt: Path | None, what: str = "read with") -> dict[str, Any]:
-    """The options with which the log was read that a file is learnt from, or ``units`` in it."""
+def read_with(learnt: Path | None) -> tuple[dict[str, Any], dict[str, str]]:
+    """The options with which the log was read that a file is learnt from, and units in it."""
     from evofsm.store import read_header
 
     if learnt is None or not learnt.is_file():
-        return {}
-    return dict(read_header(learnt).provenance.get(what, {}))
+        return {}, {}
+    provenance = read_header(learnt).provenance
+    return dict(provenance.get("read with", {})), dict(provenance.get("units", {}))
 
 
 def typed(given: Mapping[str, Any]) -> str:

@@ -164,12 +164,13 @@ def to_prism(model: FSMModel, evidence: float = 1.0, least: float = 0.0) -> str:
         raise ValueError(f"{fault} (has its machine been told its actions?)")
     body, unknown = list[str](), list[int]()
     arrivals = model.changes @ model.recognise(model.centers)  # and what is believed beside it
+    was_seen = arrivals > _STRAY * model.changes.sum(axis=1, keepdims=True)
     for state in range(n):
         about = [f"#{state + 1}", *(_where(model, state) if model.names else [])]
         body += ["", f"  // {', '.join([*about, counted(round(model.visits[state]), 'visit')])}"]
         actions = np.flatnonzero(model.decisions[:, state] >= evidence).tolist()
-        where = state, arrivals[state] > _STRAY * model.changes[state].sum()
-        body += [line for action in actions for line in _command(model, *where, action, least)]
+        where = model, state, was_seen[state]
+        body += [line for action in actions for line in _command(*where, action, least)]
         if not actions:
             unknown.append(state + 1)
             body[-1] += ": no action has the evidence"

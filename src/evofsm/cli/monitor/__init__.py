@@ -135,8 +135,8 @@ def monitor(
     system = {name: part for name, part in parts.items() if part is not None}
     how: Any = brakes, options.TOLERANCE if tolerance is None else tolerance
     make: Any = partial(guard_of_monitor, interval or _INTERVAL, *how, traffic=traffic)
-    notice, reader = assumptions(*how), {**options.read_with(guard or state), **reading}
-    units = options.read_with(guard or state, "units")
+    log_options, units = options.read_with(guard or state)
+    notice, reader = assumptions(*how), {**log_options, **reading}
     if guard is not None:
         make = partial(load_learning, guard, reader.get("failed"))
         notice = f"assumed: what {guard} was given and has learnt"

@@ -72,10 +72,10 @@ def watch(
     with suppress(KeyboardInterrupt):
         if is_log:
             risk = None if tolerance == options.TOLERANCE else tolerance
-            reader = {**options.read_with(guard), **reading}
+            log_options, units = options.read_with(guard)
+            reader = {**log_options, **reading}
             log_guard = None if guard is None else load_learning(guard, reader.get("failed"))
             try:
-                units = options.read_with(guard, "units")
                 log_format = replace(options.reading_of(**reader), usual_units=units)
                 is_simulation = what.endswith(options.SUMO)
                 show = session.watched_simulation if is_simulation else session.watched_log
