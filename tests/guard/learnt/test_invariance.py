@@ -66,19 +66,21 @@ SEEDS = [*range(2), *(pytest.param(seed, marks=pytest.mark.slow) for seed in ran
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_points_are_kept_from_the_wall_however_they_are_written(point, seed):
-    told, changed = point.told, []
-    otherwise = Otherwise.drawn(told, 2 * point.places, np.random.default_rng(seed))
+    told, changed, rng = point.told, [], np.random.default_rng(seed)
+    otherwise = Otherwise.drawn(told, 2 * point.places + 1, rng)
     pair = [type(point)(one, point.places).guard(seed=seed) for one in (told, otherwise.told(told))]
     for episode in range(4):
         steps = point.walk(1000 * seed + episode, steps=40)
         z, proposal, failed = next(steps)
+        load = rng.normal()  # which differs from episode to episode alone
         while proposal is not None:
+            z = np.append(z, load)
             said = pair[0].decide(z, proposal)
             again = pair[1].decide(otherwise.see(z), otherwise.act(told, proposal))
             back = otherwise.back(told, again.executed)
             np.testing.assert_allclose(back, said.executed, rtol=0, atol=1e-5, err_msg=said.reason)
             changed.append(not np.array_equal(said.executed, said.proposed))
             z, proposal, failed = steps.send(said.executed)
-        pair[0].end(failed, z)
+        pair[0].end(failed, z := np.append(z, load))
         pair[1].end(failed, otherwise.see(z))
     assert np.mean(changed) > 0.05

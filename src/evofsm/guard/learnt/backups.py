@@ -135,7 +135,9 @@ def evolved(state: State, model: Model, residuals: Floats, random: Generator) ->
     values = np.array([worth(policy) for policy in policies])
     parents = np.flatnonzero(state.linear == 1.0)
     shape, m = policies.shape[1:], len(model.origin)
-    variables, flips = basis((situations[:, :m] - model.mean) * model.inverse)
+    away = (situations[:, :m] - model.mean) * model.inverse
+    variables, flips = basis(away)
+    flips[(away**3).sum(0) == 0.0] = 0.0  # of what did not vary yet it knows no direction
     actions, turns = basis(situations[:, 2 * m :], model.choices)
     cells = np.ix_(np.argsort(actions), np.argsort(np.append(0, 1 + variables)))
     signs = np.append(1.0, flips) * turns[:, None]
