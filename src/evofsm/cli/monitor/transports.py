@@ -231,20 +231,22 @@ class ZenohTransport:
     def __init__(self, key: str) -> None:
         with needs("eclipse-zenoh", "zenoh", "Zenoh"):
             import zenoh
+        if "*" in key:
+            fault = "names several machines, and each needs a monitor of its own"
+            raise ValueError(f"--zenoh {key}: a KEY with * {fault}")
+        file = os.environ.get("ZENOH_CONFIG")
         try:
-            file = os.environ.get("ZENOH_CONFIG")
+            zenoh.KeyExpr(key)
             config = zenoh.Config.from_file(file) if file else zenoh.Config()
             self._session = zenoh.open(config)
-        except zenoh.ZError as error:
-            raise ValueError(f"Zenoh: {error}") from None
-        try:
             self._publisher = self._session.declare_publisher(
                 f"{key}/decision", express=True, priority=zenoh.Priority.REAL_TIME
             )
             self._rows = self._session.declare_subscriber(f"{key}/row")
         except zenoh.ZError as error:
-            self.close()
-            raise ValueError(f"--zenoh {key}: {error}") from None
+            fault = str(error).rsplit(" at ", 1)[0]  # behind it is a line of Zenoh's own
+            where = f", by ZENOH_CONFIG={file}" if file else ""
+            raise ValueError(f"--zenoh {key}{where}: {fault}") from None
 
     def serve(self, server: Server) -> None:
         """Answer what comes, until it is closed."""
