@@ -104,8 +104,9 @@ def test_what_is_in_a_log_is_said_with_a_command_that_learns_from_it(evofsm, wri
         for part in (rows[:cut], rows):  # as it is ended and begun anew in an alarm
             Path("part.csv").write_bytes(b"".join(part))
             words = "--guard", "guard.evofsm", "--state", "state", "--text"
-            parts.append(evofsm("monitor", "part.csv", *words).stdout)
-        assert ("alarm: " in parts[0], "".join(parts)) == (True, live)
+            parts.append(evofsm("monitor", "part.csv", *words))
+        assert ("alarm: " in parts[0].stdout, "".join(p.stdout for p in parts)) == (True, live)
+        assert re.search(rf"^evofsm: \S+ \S+  alarm.*: {VIBRATION} [0-9.]+", parts[1].stderr, re.M)
         assert re.findall(rf"  alarm: {VIBRATION} [0-9.]+: above", live)
         assert "refused" not in live
 

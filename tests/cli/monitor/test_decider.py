@@ -102,6 +102,22 @@ def test_in_words_it_is_said_where_the_risk_is_not_known():
     assert lacks[:2] == [b"9  note: no trip in the row\n", b""]
 
 
+def test_in_words_it_is_said_where_an_alarm_goes_blind_and_what_stands():
+    usual = {"kind": "decision", "risk_proposed": 0.9, "alarm": True, "reason": "heat 9: above 7"}
+    blind = {**usual, "reason": "not seen: heat; the alarm stays on"}
+    over = {**usual, "alarm": False, "risk_proposed": 0.0, "reason": "not seen: oil"}
+    answers = over, usual, blind, blind, usual, blind, over, {**over, "reason": ""}, blind, usual
+    text, stands = Text(), "1  alarm: heat 9: above 7"
+    told = [(text.line({**one, "time": k}), text.standing) for k, one in enumerate(answers)]
+    lost, seen = blind["reason"], "all is seen again"
+    words = ["", stands, f"2  {lost}", "", f"4  {seen}", f"5  {lost}", "6  over, after 5 s"]
+    words += [f"7  {seen}", f"8  alarm: {lost}", f"9  {seen}"]
+    assert [said.decode().rstrip() for said, _ in told] == words
+    standing = [standing for _, standing in told]
+    assert standing[:3] == ["", stands, f"2  alarm, for 1 s: {lost}"]
+    assert standing[6:8] == ["6  not seen: oil", ""]
+
+
 def test_gaps_in_time_and_rows_that_come_too_often_are_noted():
     decider = Decider(made(), slots=Slots(LogColumns(hole=5.0)))
     row, times = next(iter(rows(1))), (0, 0.1, 3.1, 3.12, 3.14, 9)

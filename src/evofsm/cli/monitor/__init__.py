@@ -226,14 +226,17 @@ def monitor(
             answers = decided_on_log(decider, chunks) if chunks else decided_on_lines(decider, file)
             show(*summary_of(decider, answers, str(file)))
             return None
-        line = Text().line if text else json_line
+        words = Text()
+        line = words.line if text else json_line
         if warm:
             decider.warm()
             warn("compiled")
         if keeper is not None:
-            again = keeper.begin(decider, line)
+            again = keeper.begin(decider, words.line)
             if decider.n:
                 warn(f"goes on after decision {decider.n} ({again} rows taken in again)")
+            if words.standing:
+                warn(words.standing)
         server = Server(decider, keeps=keeper is not None, line=line)
         transport, where = transport_of(file, socket, zenoh, stack)
         if keeper is not None and isinstance(transport, Stream) and file and file.is_file():

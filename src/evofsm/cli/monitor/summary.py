@@ -24,14 +24,16 @@ _LONGEST_MESSAGE = 1 << 20  # a line of more bytes is of another kind of file
 _TOLERANCES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)  # beside the guard's own tolerance
 # So many moments and variables are shown; without an alarm a moment lasts so long [s].
 _WORST, _MOST_VARIABLES, _MOMENT = 10, 4, 5.0
+_ALL_SEEN = "all is seen again"  # said after a variable was lost in an alarm
 
 
 class Text:
-    """Answers in words: when an alarm begins, ends or is not known, failures, and refusals."""
+    """Answers in words: when an alarm begins, ends or goes blind, failures, and refusals."""
 
     def __init__(self) -> None:
         self._since: float | None = None  # when the alarm began that is on [s]
-        self._is_blind = False  # whether the risk is not known
+        self._again = ""  # what is said once it is known, or seen, again; empty while it is
+        self.standing = ""  #: the alarm that is on, or why the risk is not known; mostly nothing
         self._counts: dict[str, int] = {}  # of notes and refusals alike
 
     def line(self, answer: Answer) -> bytes:
@@ -45,7 +47,7 @@ class Text:
         time = math.nan if time is None else time + 3600.0 * part.get("hours", 0.0)  # runs on
         if since is not None and ": a new episode" in note:  # after a hole, perhaps
             yield f"{when}over: {note}"
-            since, self._since, note = None, None, ""
+            since, self._since, note, self.standing = None, None, "", ""
         lasts = math.nan if since is None else time - since
         after = f" {span(lasts)}" if lasts >= 0.0 else ""
         over = f"over, after{after}" if after else "over"
@@ -56,20 +58,25 @@ class Text:
             if str(count).strip("0") == "1":  # the 1st, 10th, 100th ...
                 yield f"{when}{text}{f' ({count:,} times by now)' * (count > 1)}"
         if kind == "end":
-            self._since = None
+            self._since, self.standing = None, ""
             if part["failed"]:
                 text = " no alarm was on" if since is None else f"{after} after the alarm"
                 yield f"{when}failure,{text}"
             elif since is not None:
                 yield f"{when}{over} ({part.get('reason', 'the episode ended')})"
         elif kind == "decision":
+            reason, is_new = part["reason"], part["alarm"] and since is None
             if part["alarm"] == (since is None):
-                self._since = time if part["alarm"] else None
-                yield when + (f"alarm: {part['reason']}" if part["alarm"] else over)
+                self._since = time if is_new else None
+                yield when + (f"alarm: {reason}" if is_new else over)
             is_blind = part["risk_proposed"] is None and part.get("ahead", "") is not None
-            if is_blind != self._is_blind:
-                yield f"{when}{part['reason'] if is_blind else 'the risk is known again'}"
-            self._is_blind = is_blind
+            is_partly = "not seen: " in reason and (part["alarm"] or self._again == _ALL_SEEN)
+            again = "the risk is known again" if is_blind else _ALL_SEEN * is_partly
+            if bool(again) != bool(self._again) and not (again and is_new):
+                yield f"{when}{reason if again else self._again}"
+            self._again = again
+            alarm = f"alarm{after and f', for{after}'}: " * part["alarm"]
+            self.standing = f"{when}{alarm}{reason}" if alarm or again else ""
 
 
 def _refusal(answer: Answer) -> str:
