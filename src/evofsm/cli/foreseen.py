@@ -62,11 +62,12 @@ def show_foreseen(
     as_json: bool,
 ) -> None:
     """Say what came of the alarms of a guard, or of one that learns from the log's first part."""
-    title, held_out = str(file), "; not held out, if this guard learnt from them"
+    title, held_out, before = str(file), "; not held out, if this guard learnt from them", 0
     if guard is None:
         rows = np.cumsum([len(e.times) for e in episodes])
         first = int((rows <= split * rows[-1]).sum())
         first_part, episodes = _of_two_rows(episodes[:first]), episodes[first:]
+        before = len(first_part)
         fault = ""
         if not any(e.failed for e in (*first_part, *episodes)):
             fault = "no episode failed, so there is nothing to foresee (--failed says what did)"
@@ -78,7 +79,7 @@ def show_foreseen(
         if fault:
             raise ValueError(f"{file}: {fault}")
         guard = guard_where_nobody_acts(first_part, labels, asked)
-        learnt_from = "episode" if first == 1 else f"{len(first_part):,} episodes"
+        learnt_from = "episode" if first == 1 else f"{before:,} episodes"
         title += f": learnt from its first {learnt_from}, judged by the rest"
         held_out = f", held out (the last {1.0 - rows[first - 1] / rows[-1]:.0%} of the rows)"
     at_once = sum(e.failed for e in episodes if len(e.times) == 1)
@@ -91,6 +92,9 @@ def show_foreseen(
     times = np.concatenate([e.times for e in episodes])
     columns = judge.columns(runs)
     document = {**_document(judge, runs, times, columns), "failures_at_once": at_once}
+    document["episodes_before"] = before
+    for entry in (*document["listed"], *document["missed"]):
+        entry["episode"] += before  # counted in the log, as `evofsm watch` does
     if plot is not None:
         _draw(judge, guard.machine, runs, times, document, plot)
     if as_json:
@@ -251,7 +255,7 @@ def _draw(
             numbers = np.searchsorted(runs.last, ends)
             typical = int(np.argsort(runs.lengths[numbers])[len(ends) // 2])
             first, last = int(runs.starts[numbers[typical]]), int(ends[typical])
-            title = f"{word}: episode {numbers[typical] + 1:,}"
+            title = f"{word}: episode {document['episodes_before'] + numbers[typical] + 1:,}"
             title += f", {date(times[last])}" * bool(times[last] >= DATES)
             parts[title] = slice(max(first, last - 4 * judge.horizon), last + 1)
     names = [judge.labels.variable(v) for v in range(runs.rows.shape[1])]
