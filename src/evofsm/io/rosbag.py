@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from evofsm.extras import needs
 from evofsm.fsm.naming import in_a_line
+from evofsm.guard.foresight import span
 from evofsm.io import tables
 from evofsm.io.tables import UNITS, Piece, RefusedError, Skips, Table, Wanted, in_row, readable
 from evofsm.io.vehicles import ACTION
@@ -312,8 +313,8 @@ class BagTable(Table):
             bag_span, own_span = (last - first) / _NANOSECONDS, (end - begin) / _NANOSECONDS
             if own_span and abs(own_span - bag_span) > max(_SPAN, _SHARE * bag_span):
                 self.skips.told.append(
-                    f"{self.path}: messages of {topic} span {own_span:.3g} s by their headers, and "
-                    f"{bag_span:.3g} s as recorded, by which times are (played, or simulated, at "
+                    f"{self.path}: messages of {topic} span {span(own_span)} by their headers, and "
+                    f"{span(bag_span)} as recorded, by which times are (played, or simulated, at "
                     'another speed?): stamp = "header" in the file of --topics goes by the headers'
                 )
                 return

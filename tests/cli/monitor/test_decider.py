@@ -120,11 +120,12 @@ def test_in_words_it_is_said_where_an_alarm_goes_blind_and_what_stands():
 
 def test_gaps_in_time_and_rows_that_come_too_often_are_noted():
     decider = Decider(made(), slots=Slots(LogColumns(hole=5.0)))
-    row, times = next(iter(rows(1))), (0, 0.1, 3.1, 3.12, 3.14, 9)
+    row, times = next(iter(rows(1))), (0, 0.1, 3.1, 3.12, 3.14, 9, 3609)
     notes = [decider.answer(line(row | {"time": t})).get("note") for t in times]
     assert notes[:3] == [None, None, "3 s without a row: nothing is learnt or carried across"]
     assert notes[3].startswith("rows come every 0.02 s, but the guard was made for 0.1 s")
-    assert notes[4:] == [None, "5.86 s without a row (--hole 5s): a new episode"]
+    anew = "without a row (--hole 5s): a new episode"
+    assert notes[4:] == [None, f"5.86 s {anew}", f"60 min {anew}"]
 
 
 @pytest.mark.parametrize("answered", [1, 2, 10, 19, 22, 23, 24, 27, 28])

@@ -123,6 +123,7 @@ def monitor(
     from evofsm.driving.naming import VARIABLES
     from evofsm.fsm import Labels
     from evofsm.guard import AuditLog, Foresight
+    from evofsm.guard.foresight import span
     from evofsm.io.tables import is_number
 
     acts = {"low": low, "high": high, "n_actions": n_actions}
@@ -176,7 +177,7 @@ def monitor(
                 raise ValueError(f"{file}: no episode has two rows")
             chunks, interval = chain([first], episodes), first.dt
             if sentry and not abs(interval / sentry.interval - 1.0) < _SAME_STEP:
-                warning = f"{file} has a row every {interval:.2g} s, and {guard} decides each"
+                warning = f"{file} has a row every {span(interval)}, and {guard} decides each"
                 warn(f"warning: {warning} {sentry.interval:g} s: --resample {sentry.interval:g}s")
             if alone:
                 options.refuse_other_limit(False, alarms, tolerance)

@@ -32,7 +32,7 @@ from evofsm.fsm.validation import probability
 from evofsm.guard import ActionReviser, BoxActions, Choices, Foresight, Guard, LearntRisk, Mode
 from evofsm.guard.api import Proposal, Revision
 from evofsm.guard.audit_log import AuditLog
-from evofsm.guard.foresight import DATES
+from evofsm.guard.foresight import DATES, span
 from evofsm.guard.reviser import is_spoken, make_usable, passed
 from evofsm.io.logs import hours_unsaid
 from evofsm.io.tables import IN_UTC, date
@@ -281,7 +281,7 @@ class Decider:
         if told.observation and told.ahead != latest.ahead:
             return "another one is ahead"
         if hole is not None and step > max(hole, HOLE * self.guard.interval):
-            return f"{step:.3g} s without a row (--hole {hole:g}s)"
+            return f"{span(step)} without a row (--hole {hole:g}s)"
         return ""
 
     def _waited(self, *, early: bool = False) -> Answer:
@@ -383,10 +383,10 @@ class Decider:
         interval, before = self.guard.interval, self.decided_on
         step = row.time - before.time if before and self.rows else interval
         if step > HOLE * interval:
-            yield f"{step:.3g} s without a row: nothing is learnt or carried across"
+            yield f"{span(step)} without a row: nothing is learnt or carried across"
         if step < _OFTEN * interval and self._is_first("often"):
             text = f"the guard was made for {interval:g} s: --resample {interval:g}s"
-            yield f"rows come every {step:.3g} s, but {text}"
+            yield f"rows come every {span(step)}, but {text}"
         if row.hours is None and row.time >= DATES and self._is_first(IN_UTC):
             yield IN_UTC
         variables = zip(self.form.variables, self._units, row.observation or (), strict=False)

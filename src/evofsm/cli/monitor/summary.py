@@ -140,7 +140,7 @@ def summary_of(decider: Decider, answers: Answers, title: str) -> Iterator[Rende
     usual = np.sort(steps)[(len(steps) - 1) // 2]
     text = f"{len(rows):,} in {begins.sum():,.0f} episodes, {durations.sum() / 3600.0:.3g} h"
     if usual > HOLE * interval:
-        text += f"; they come every {usual:.3g} s, and count as {interval:g} s each (--interval)"
+        text += f"; they come every {span(usual)}, and count as {interval:g} s each (--interval)"
     pairs = [("rows", text), ("alarms", f"{count}, or {hourly} an hour, {share} of the time")]
     if useless := refusing(alarms @ durations / durations.sum()):
         pairs.append(("beware", f"it {useless}"))
