@@ -60,7 +60,8 @@ def test_rows_from_a_file_and_from_standard_input_are_answered_alike(tmp_path):
     file = tmp_path / "rows.jsonl"
     file.write_bytes(b"\n".join(ROWS))
     by_hand = answers_to(ROWS, learn=False)
-    for result in (evofsm(file), evofsm(lines=ROWS), evofsm("--warm", lines=ROWS)):
+    piped = evofsm(lines=ROWS), evofsm("-", lines=ROWS), evofsm("--warm", lines=ROWS)
+    for result in (evofsm(file), *piped):
         assert told(result) == by_hand
     assert "compiled" in result.stderr
 

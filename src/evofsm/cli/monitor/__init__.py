@@ -100,6 +100,7 @@ def monitor(
                 file = path
     if [file, socket, zenoh].count(None) < 2:
         raise ValueError("give one of FILE, --socket and --zenoh")
+    file = None if file == Path("-") else file  # as which others name standard input
     if plot is not None and not summary:
         raise ValueError("--plot draws what --summary says, where nobody acts")
     if plot is not None:
