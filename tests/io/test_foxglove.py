@@ -8,6 +8,7 @@ import time
 import tracemalloc
 from contextlib import suppress
 from itertools import chain, compress
+from unittest.mock import patch
 
 import pytest
 from mcap.reader import make_reader
@@ -189,5 +190,10 @@ def test_what_cannot_be_shown_is_refused(tmp_path):
         guard.decide([1.0, 2.0], proposal=0.0)
     with pytest.raises(ValueError, match="needs a port, a file, or both"):
         FoxgloveSink(None)
+    for names in (["x", "x"], ["time", "x"], ["episode"]):
+        with pytest.raises(ValueError, match=f"two fields '{names[0]}'; name others in names="):
+            FoxgloveSink(None, tmp_path / "other.mcap", names=names)
+    with patch("foxglove.start_server") as start, FoxgloveSink(0, host="::1") as sink:
+        assert sink.address == f"ws://[::1]:{start.return_value.port}"
     with FoxgloveSink(0) as sink, pytest.raises(RuntimeError):
         FoxgloveSink(int(sink.address.rpartition(":")[2]))

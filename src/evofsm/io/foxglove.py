@@ -141,7 +141,7 @@ class FoxgloveSink(AbstractContextManager["FoxgloveSink"], DecisionLogger):
     Raises
     ------
     ValueError
-        If there is neither a port nor a file.
+        If there is neither a port nor a file, or two fields of a message had one name.
     RuntimeError
         If the port is taken.
     FileExistsError
@@ -176,6 +176,9 @@ class FoxgloveSink(AbstractContextManager["FoxgloveSink"], DecisionLogger):
     ) -> None:
         if port is None and file is None:
             raise ValueError("a sink needs a port, a file, or both")
+        fields = ["time", "intake", "kind", "episode", *names]  # of a message
+        if twice := [name for name in names if fields.count(name) > 1]:
+            raise ValueError(f"a message would have two fields {twice[0]!r}; name others in names=")
         self._names = tuple(names)
         self._columns = columns_by_topic(names, units)
         context = self._context = foxglove.Context()  # its channels close with it
@@ -199,7 +202,8 @@ class FoxgloveSink(AbstractContextManager["FoxgloveSink"], DecisionLogger):
         if port is not None:
             server = foxglove.start_server(name="evofsm", host=host, port=port, context=context)
             self._open.callback(server.stop)
-            self.address = f"ws://{host}:{server.port}"
+            place = f"[{host}]" if ":" in host else host
+            self.address = f"ws://{place}:{server.port}"
             self._start = time.time_ns()  # live, a message is now; in a file time is 0
         self._time = 0.0  # of the latest decision, in its episode [s]
         self._observation: NDArray[np.float64] = np.full(len(names), math.nan)
