@@ -583,6 +583,16 @@ def test_a_hole_costs_a_transition_and_a_longer_one_an_episode(tmp_path, pieces,
     assert sum(unknown) == noted.crossed == (3 - len(episodes) if hole else 0)
 
 
+@pytest.mark.parametrize("columns", [{}, {"hole": 60.0}, {"resample": Resample(0.1)}])
+def test_an_episode_begins_as_its_columns_say_though_its_first_rows_lack_a_number(
+    tmp_path, pieces, columns
+):
+    gaps = {"p": ["", 1, 2, 3], "q": ["", "", 4, 5], "r": ["x"], "s": [6]}
+    lines = [line for pair in gaps for line in short(gaps[pair], pair, crash="0000")]
+    path = write(tmp_path / "a.csv", lines, SHORT)
+    assert together(path, **columns)[:2] == ([1, 2, 3, 4, 5, 6], [0, 3, 5])
+
+
 STOPS = ["0 1 1 on", "1 2 9 on", "2 3 9 on", "3 4 0 on", "4 5 0 off", "5 6 9 on", "6 7 9 off"]
 
 

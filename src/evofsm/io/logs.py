@@ -1039,10 +1039,12 @@ class _Reader:
         if not columns.longest_hole:
             elsewhere |= piece.bad
         ends = fails | still | elsewhere
-        for row in np.flatnonzero(late):  # which ends none, nor hides that one ended
-            ends[row] = ends[row - 1] if row else self._ended
+        ends[late] = False
         starts |= np.append(self._ended, ends[:-1])
-        self._ended, self._kept = bool(ends[-1]), bool(is_kept[-1])
+        counts = np.cumsum(starts)  # an episode whose first rows are left out begins with the next
+        starts[is_kept] = np.diff(counts[is_kept], prepend=0) > 0
+        self._ended = bool(ends[-1] or counts[-1] > counts[is_kept].max(initial=0))
+        self._kept = bool(is_kept[-1])
         return is_kept, fails
 
     def _note_compared(self, piece: Piece, failed: Condition) -> None:
