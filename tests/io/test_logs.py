@@ -364,7 +364,8 @@ def test_what_was_appended_is_read_by_its_own_names(tmp_path, pieces):
     chunks = read(path, episode=[])
     seen = np.concatenate([chunk.observations for chunk in chunks]).tolist()
     assert seen == [[7, 10, 11], [8, 10, 11], [9, 10, 11], *([gap, 20, 21] for gap in (1, 2, 3))]
-    assert together(path, episode=[])[1] == [0, 2, 3]
+    for columns in ({}, {"hole": 60.0}, {"resample": Resample(0.1)}, {"no_leader": "end"}):
+        assert together(path, episode=[], **columns)[1] == [0, 2, 3]
     lacks = write(tmp_path / "b.csv", [*short([7]), other.replace("gap", "distance"), *more], SHORT)
     assert "line 3: it names the columns anew, without 'gap'" in refusal(lacks)
 

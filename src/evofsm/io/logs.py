@@ -973,6 +973,7 @@ class _Reader:
                     f"taken for an episode of its own; sort the file by {names} and then by time"
                 )
             self._known.add(tuple(episode))
+        starts[[row for row in piece.headers if row < piece.rows]] = True
         return starts
 
     def _sift(self, piece: Piece, anew: Bools, starts: Bools, late: Bools) -> tuple[Bools, Bools]:

@@ -320,6 +320,7 @@ class Piece:
     starts: Sequence[int] | None = None
     names: Sequence[str] = ()  #: of these episodes, of a table that knows
     anew: Sequence[int] = ()  #: rows before which something was left out; behind the last one too
+    headers: Sequence[int] = ()  #: and those before which the columns are named again
     cut: str = ""  #: column in which the last row's field may go on, as nothing ends it
     bad: NDArray[np.bool_] = field(init=False)  #: (T,) rows to leave out
 
@@ -358,6 +359,7 @@ class Piece:
             texts={name: texts.gather(rows) for name, texts in self.texts.items()},
             find=lambda row: self.find(int(rows[row])),
             anew=np.searchsorted(rows, self.anew).tolist(),
+            headers=np.searchsorted(rows, self.headers).tolist(),
             cut=self.cut if rows[-1:].tolist() == [self.rows - 1] else "",
         )
         piece.bad[:] = self.bad[rows]
@@ -385,13 +387,11 @@ class Wanted(NamedTuple):
         """Columns that are read, each once."""
         return list(dict.fromkeys([*self.numbers, *self.texts, *self.dates]))
 
-    def piece(
-        self, frame: polars.DataFrame, find: Find, skips: Skips, anew: Sequence[int] = ()
-    ) -> Piece:
+    def piece(self, frame: polars.DataFrame, find: Find, skips: Skips) -> Piece:
         """The columns of some rows as what is wanted of them; numbers may be given as texts."""
         import polars
 
-        piece = Piece(len(frame), {}, find, skips, anew=anew)
+        piece = Piece(len(frame), {}, find, skips)
         for name in self.numbers:
             values = frame[name]
             if values.dtype == polars.String:
@@ -439,7 +439,8 @@ class _Odd(NamedTuple):
 
     columns: Sequence[str]  #: of the next lines
     rows: list[tuple[int, list[str]]]  #: lines, and what is wanted of them
-    anew: list[int]  #: rows before which something was left out, or the columns are named again
+    anew: list[int]  #: rows before which something was left out
+    headers: list[int]  #: rows before which the columns are named again
     left_out: list[tuple[int, str]]  #: lines that are no rows, and why; of a comment nothing
 
 
@@ -543,15 +544,16 @@ class CsvTable(Table):
         if twice := [name for name in wanted.all if self.columns.count(name) > 1]:
             fault = f"two columns are called {twice[0]!r}"
             raise ValueError(f"{self.path}, line {self._above}: {fault}")
-        columns, behind = self.columns, False
+        columns, behind = self.columns, [False, False]
         with Source(self.path, self.skips) as source:
             for block, lines_before in self._blocks(source):
                 here = partial(self._odd, block, lines_before, columns, wanted)
-                frame, anew = self._plain(block, columns, wanted), [0] if behind else []
+                frame = self._plain(block, columns, wanted)
+                anew, headers = ([0] * is_first for is_first in behind)
                 is_cut = source.is_cut
                 if frame is None:
                     odd = here()
-                    columns, anew = odd.columns, anew + odd.anew
+                    columns, anew, headers = odd.columns, anew + odd.anew, headers + odd.headers
                     is_cut &= lines_before + block.count(b"\n") in [n for n, _ in odd.rows[-1:]]
                     for line, why in odd.left_out:
                         place = f"{self.path}, line {line}: {why or 'a comment'}"
@@ -562,9 +564,10 @@ class CsvTable(Table):
                 if self._dialect.has_commas:
                     texts = selectors.by_name(wanted.numbers) & selectors.string()
                     frame = frame.with_columns(texts.str.replace(",", ".", literal=True))
-                behind = len(frame) in anew
-                if len(frame) or anew:
-                    piece = wanted.piece(frame, partial(self._find, here, wanted), self.skips, anew)
+                behind = [len(frame) in rows for rows in (anew, headers)]
+                if len(frame) or anew or headers:
+                    piece = wanted.piece(frame, partial(self._find, here, wanted), self.skips)
+                    piece.anew, piece.headers = anew, headers
                     piece.cut = columns[-1] if is_cut else ""
                     yield piece
 
@@ -612,7 +615,8 @@ class CsvTable(Table):
         """The rows of some lines; those of another length are none."""
         text = io.StringIO(block.decode(), newline="")
         reader = csv.reader(text, delimiter=self._dialect.separator, strict=True)
-        rows, anew, left_out = list[tuple[int, list[str]]](), list[int](), list[tuple[int, str]]()
+        rows, left_out = list[tuple[int, list[str]]](), list[tuple[int, str]]()
+        anew, headers = list[int](), list[int]()
         places = [columns.index(name) for name in wanted.all]
         may_name = any(name.encode() in block for name in wanted.all)
         last_line = 0
@@ -623,7 +627,7 @@ class CsvTable(Table):
                     if may_name and self._named_anew(fields, wanted, line):
                         columns = _names(fields)
                         places = [columns.index(name) for name in wanted.all]
-                        anew.append(len(rows))
+                        headers.append(len(rows))
                     elif len(fields) == len(columns):
                         rows.append((line, [fields[place] for place in places]))
                     elif _COMMENT.match(fields[0]):
@@ -632,7 +636,7 @@ class CsvTable(Table):
                         anew.append(len(rows))
                         left_out.append((line, self._dialect.miscounted(len(fields), len(columns))))
                     last_line = reader.line_num
-                return _Odd(columns, rows, anew, left_out)
+                return _Odd(columns, rows, anew, headers, left_out)
             except csv.Error as error:
                 line, why = reached + reader.line_num, f"{error} (an unclosed quote?)"
                 if reader.line_num > last_line + 1:
