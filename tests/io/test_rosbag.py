@@ -1,6 +1,10 @@
 """Bags of ROS 2 that the library rosbags wrote, read as rows of one clock."""
 
 import re
+import shutil
+import sqlite3
+from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -235,6 +239,17 @@ def test_an_action_may_be_mapped_and_failures_be_told_of_by_a_comparison(tmp_pat
     touch = 1.98, OTHER, odometry(0.0, 0.0)  # with which the recording ends
     (chunk,) = read(write(tmp_path / "touch", [*drive(), touch]), failed="gap<0")
     assert np.flatnonzero(chunk.fails).tolist() == [len(chunk.times) - 1]
+
+
+def test_what_a_recorder_that_was_killed_left_beside_its_file_is_read(tmp_path):
+    (file,) = Path(write(tmp_path / "bag", drive())).glob("*.db3")
+    with closing(sqlite3.connect(file)) as bag:  # as rosbag2's storage preset "resilient"
+        bag.execute("PRAGMA journal_mode=wal")
+        bag.execute("DELETE FROM messages WHERE timestamp > ?", (101 * SECOND,))
+        bag.commit()
+        for part in tmp_path.glob("bag/*.db3*"):
+            shutil.copy(part, tmp_path)
+    assert read(str(tmp_path / file.name))[0].times[-1] == pytest.approx(1.0)
 
 
 def test_a_bag_that_is_damaged_says_so(tmp_path):

@@ -382,7 +382,9 @@ def _files(path: Path) -> Iterator[tuple[Path, bool]]:
 
 
 def _of_sqlite(file: Path, wanted: Collection[str], there: set[str]) -> _Messages:
-    with closing(sqlite3.connect(f"{file.absolute().as_uri()}?immutable=1", uri=True)) as bag:
+    log = Path(f"{file}-wal")  # beside it, of what was written last; an immutable file has none
+    how = "mode=ro" if log.is_file() and log.stat().st_size else "immutable=1"
+    with closing(sqlite3.connect(f"{file.absolute().as_uri()}?{how}", uri=True)) as bag:
         rows = bag.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
         there |= {topic for _, topic, *_ in rows}
         definitions: dict[str, list[str]] = {}
