@@ -532,6 +532,18 @@ def test_what_no_car_can_do_is_refused_unless_it_stands_for_nobody(tmp_path, row
     assert together(path, no_leader=nobody)[0] == [9, 8, 7]
 
 
+@pytest.mark.parametrize(
+    ("encoding", "odd"), [("utf8", "\xff"), ("utf8", "\xc3"), ("cp1252", "\x81")]
+)
+def test_one_odd_byte_does_not_change_what_all_others_mean(tmp_path, pieces, encoding, odd):
+    lines = [f"p,{k / 10},{9 - k},1,1,0,{'Störung' if k > 2 else 'läuft'}," for k in range(4)]
+    text = "\n".join([f"{SHORT},note", *lines, ""]).encode(encoding)
+    path, noted = tmp_path / "a.csv", Noted()
+    path.write_bytes(text[:-1] + odd.encode("latin1") + b"\n")
+    assert together(str(path), noted=noted, failed="crash==Störung")[2] == [3]
+    assert "a.csv, line 5" in "".join(warnings_of(noted))
+
+
 # -- Clocks of machines ---------------------------------------------------------------------------
 
 

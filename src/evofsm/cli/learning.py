@@ -44,6 +44,7 @@ _LEFT_OUT = {
     "action": "rows have no action, and what leads on from them was not learnt",
     "stand-in": "numbers of the action are far from all others, and were read as missing",
     "cut": "file ends early, and what is whole was read",
+    "letter": "lines have letters of another encoding than most, read as '\ufffd'",
 }
 _NO_SPEED = 500.0  # no car's speed in any unit [m/s]: revolutions, perhaps
 #: Columns of more different numbers are no choice among some; and the most intervals for those.

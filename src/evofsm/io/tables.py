@@ -576,7 +576,12 @@ class CsvTable(Table):
         lines_before = 0
         while block := source.rows():
             if not block.isascii():
-                block = decoded(block, self.path, lines_before).encode()
+                text = decoded(block, self.path, lines_before)
+                block_lines = text.split("\n") if "\ufffd" in text else ()
+                for number, line in enumerate(block_lines, lines_before + 1):
+                    if "\ufffd" in line:
+                        self.skips.leave_out("letter", f"{self.path}, line {number}", 0)
+                block = text.encode()
             while lines_before < self._above:
                 block, lines_before = block.partition(b"\n")[2], lines_before + 1
             lines = _count(block, b"\n")
@@ -712,12 +717,15 @@ class ParquetTable(Table):
 
 
 def decoded(block: bytes, path: str, reached: int = 0) -> str:
-    """Lines in UTF-8 or, where they are none, in the encoding of Western Europe."""
+    """Lines in UTF-8 or, where most letters beyond ASCII are none, in that of Western Europe."""
     try:
         return block.decode()
     except UnicodeDecodeError as error:
         if not _CONTROL.search(block):
-            return block.decode("cp1252", errors="replace")
+            text = block.decode(errors="ignore")
+            n_lost = len(block) - (n_read := len(text.encode()))  # bytes, also of those that count
+            encoding = "utf-8" if n_read - len(text) >= n_lost else "cp1252"
+            return block.decode(encoding, errors="replace")
         line = reached + block.count(b"\n", 0, error.start)
         fault = "not text in UTF-8 (a file of another kind, or saved in another encoding?)"
         raise ValueError(f"{path}, after line {line}: this is {fault}") from error
