@@ -255,6 +255,8 @@ def test_a_summary_says_how_often_it_alarms_and_is_risky_and_where_it_is_worst(t
         (("a.csv", "--plot", "x.png"), "--plot draws what --summary says"),
         (("a.parquet", "--text"), "a.parquet is read with --summary; live rows are JSON or CSV"),
         (("a.csv", "b.csv", "--summary"), "one FILE is read; cat joins several"),
+        (("--hold", 0.5), "--hold is for logs (.csv, .parquet, "),
+        (("--skip-bad", 0), "--skip-bad is for logs"),
     ],
 )
 def test_what_cannot_be_is_said_in_a_line(refused, arguments, said, tmp_path, monkeypatch):

@@ -17,6 +17,7 @@ _SAME_STEP = 0.05  # share by which the step of a log may differ from that of th
 _INTERVAL = 0.1  # of rows of cars, where nobody said another one [s]
 # What other files end with holds live rows; so does CSV without --summary.
 _LOGS = (".csv", ".parquet", ".xml", ".gz", ".mcap", ".db3", ".osi")
+_OF_LOGS = ("hold", "dt", "skip_bad", "vehicle_length", "topics")  # as live rows are not read
 _SAVED = b'{"__metadata__"'  # in the beginning of what was saved
 
 
@@ -80,7 +81,7 @@ def monitor(
     learns; nothing is changed without --mode act, and with it nothing beyond the guard's range is
     executed. Ctrl-C or SIGTERM ends it, with everything saved.
     Rows are read as options from --observe to --hole say, without one as the guard's log was,
-    whatever default stands there.
+    whatever default stands there; live rows have all values themselves: --hold needs --summary.
 
     To begin a guard of any system say what is observed (--observe), how often (--interval or
     --resample), and who acts: --low and --high, --n-actions, or nobody (--action '').
@@ -109,6 +110,9 @@ def monitor(
     is_log = file is not None and (file.suffix in _LOGS[not summary :] or file.is_dir())
     if is_log and not summary:
         raise ValueError(f"{file} is read with --summary; live rows are JSON or CSV, a line each")
+    if not is_log and (idle := [name for name in _OF_LOGS if name in reading]):
+        name = idle[0].replace("_", "-")
+        raise ValueError(f"--{name} is for logs ({', '.join(_LOGS)}), read with --summary")
     if traffic and (guard or state or learn or is_log):
         raise ValueError("--traffic judges scenes alone: no log, --guard, --state or --learn")
     if summary and (file is None or state or audit):
@@ -215,9 +219,11 @@ def monitor(
             slots = Slots(replace(row_format, usual_units=units))
         decider = Decider(sentry, episode=rows, slots=slots)
         stack.callback(decider.close)
-        if slots is not None and reader:
+        if slots is not None and (live := {k: v for k, v in reader.items() if k not in _OF_LOGS}):
             si = "; in JSON all but its column of the time is in the SI" * ("unit" in reader)
-            notice += f"; rows are read as in a log: {options.typed(reader)}{si}"
+            notice += f"; rows are read as in a log: {options.typed(live)}{si}"
+        if slots is not None and "hold" in reader:
+            notice += "; its log had several clocks (--hold), but each row has to have all values"
         if units:
             texts = ", ".join(f"{name} in {unit}" for name, unit in units.items())
             notice += f"; CSV has {texts} as in the guard's log, unless a row of units says others"
