@@ -462,6 +462,24 @@ def test_signals_of_several_clocks_are_held_at_the_times_of_actions(
     assert [21, 10, 30] not in seen.tolist()  # of 0.17 s before
 
 
+@pytest.mark.parametrize("at_once", [1 << 8, 1 << 20])
+@pytest.mark.parametrize("tell", ["p,9,0,,,,", "p,9,,,,,1"])
+@pytest.mark.parametrize("follows", [[], ["p,9.03,,10,,1,"], ["p,9.01,5,,,,0", "p,9.03,,10,,1,"]])
+def test_a_failure_that_a_row_without_an_action_tells_is_that_of_the_next_or_the_last_row(
+    tmp_path, monkeypatch, at_once, tell, follows
+):
+    monkeypatch.setattr(tables, "_CSV_BYTES", at_once)
+    run = [f"p,{8.9 - k / 10:.2f},,10,11,1,0\np,{8.95 - k / 10:.2f},9,,,," for k in range(12)][::-1]
+    again = [f"q,{k / 10},,10,11,1,0\nq,{k / 10 + 0.05},8,,,," for k in range(5)]
+    path = write(tmp_path / "a.csv", [*run, tell, *follows, *again], SHORT)
+    condition = "crash==1 or gap<=0"
+    gaps, starts, failures = together(path, failed=condition, hold=0.5)
+    last = 10 + bool(follows)
+    assert (starts, failures) == ([0, last + 1], [last])
+    gaps, _, failures = together(write(tmp_path / "b.csv", [*run, tell], SHORT), failed=condition)
+    assert (len(gaps), failures) == (11, [10])
+
+
 # -- Failures, and rows without a leader -----------------------------------------------------------
 
 

@@ -227,15 +227,19 @@ class Term(NamedTuple):
             values = piece.numbers[self.column]
             return np.asarray(_SIGNS[self.sign](values, self.value) & ~np.isnan(values))
         texts = piece.texts[self.column].str.strip_chars()
+        kinds = texts.unique().to_list()
+        return texts.is_in([kind for kind in kinds if self.truth_of(kind)]).to_numpy()
+
+    def leave_out(self, piece: Piece) -> None:
+        """Leave out rows of a piece in which there is no truth value, if it asks for one."""
         if not self.sign:
+            texts = piece.texts[self.column].str.strip_chars().str.to_lowercase()
             piece.leave_out(
                 self.column,
-                ~texts.str.to_lowercase().is_in([*_TRUTHS]).to_numpy(),
+                ~texts.is_in([*_TRUTHS]).to_numpy(),
                 "{!r} is no truth value; here a column of 0 and 1, true and false or yes and no is "
                 f"needed, or a comparison such as '{self.column}>0' or \"{self.column}=='on'\"",
             )
-        kinds = texts.unique().to_list()
-        return texts.is_in([kind for kind in kinds if self.truth_of(kind)]).to_numpy()
 
     def may_end(self, piece: Piece) -> bool:
         """Whether it holds in the last row, perhaps, only as a number was cut off there."""
@@ -775,6 +779,7 @@ class _Reader:
         # Episodes that there were, and the latest one.
         self._known: set[tuple[str, ...]] = set()
         self._latest: tuple[str, ...] | None = None
+        self._begins = False  # whether one began behind the last row that counts
         # Whether the condition held in the row before, and whether that ended its episode.
         self._held = self._ended = False
         self._kept = self._failed_before = False  # that row; whether what failed turned out later
@@ -795,11 +800,15 @@ class _Reader:
             if clock.ticks and not request.dates:
                 piece.leave_out(self._columns.time, piece.unusable(self._columns.time))
             times = self._times(piece, is_date=bool(request.dates))
-            if clock.ticks and (action_rows := self._fill(piece, times)) is not None:
-                piece, times = piece.take(action_rows), times[action_rows]
+            signals = self._fill(piece, times) if clock.ticks else None
+            starts, reports = self._starts(piece), np.zeros(piece.rows + 1, np.bool_)
+            if self._failed:
+                self._note_compared(piece, self._failed)
+            if signals is not None:
+                starts, reports = self._between(starts, *signals)
+                piece, times = piece.take(signals[0]), times[signals[0]]
             if not piece.rows:
                 continue
-            starts = self._starts(piece)
             anew, late, holes = starts.copy(), *np.zeros((2, piece.rows), np.bool_)
             if not self._columns.longest_hole:
                 starts[[row for row in piece.anew if row < piece.rows]] = True
@@ -808,7 +817,7 @@ class _Reader:
             starts |= holes
             self._before += piece.rows
             observations = np.column_stack([_encoded(piece, v) for v in self._variables])
-            is_kept, fails = self._sift(piece, anew, starts, late)
+            is_kept, fails = self._sift(piece, anew, starts, late, reports)
             if self._failed_before and last_chunk is not None:
                 last_chunk.fails[-1] = True
             if not is_kept.any():
@@ -832,8 +841,8 @@ class _Reader:
         if last_chunk is not None:
             yield last_chunk
 
-    def _fill(self, piece: Piece, times: Floats) -> NDArray[np.int64] | None:
-        """Fill in the latest values of signals, and say which rows count; None of one clock."""
+    def _fill(self, piece: Piece, times: Floats) -> tuple[NDArray[np.int64], Bools] | None:
+        """Fill in latest values; say which rows count and tell of failures; None of one clock."""
         there = {name: np.isfinite(values) for name, values in piece.numbers.items()}
         if self._hold is None:
             is_whole = np.logical_and.reduce(list(there.values())).any()
@@ -847,6 +856,8 @@ class _Reader:
                 )
         if not self._hold:
             return None
+        tells = self._failed.holds(piece) if self._failed else np.zeros(piece.rows, np.bool_)
+        tells[-1] &= not any(term.may_end(piece) for term in self._terms)
         rows = np.arange(piece.rows + 1)
         for name in set(piece.numbers) - {self._columns.time}:
             value, since = self._held_numbers.get(name, (np.nan, -np.inf))
@@ -860,7 +871,7 @@ class _Reader:
             series = texts.replace("", None).forward_fill()
             piece.texts[name] = series.fill_null(self._held_texts.get(name, ""))
             self._held_texts[name] = piece.texts[name][-1]
-        return np.flatnonzero(there[self._columns.action])
+        return np.flatnonzero(there[self._columns.action]), tells
 
     def _wanted(self) -> tuple[Wanted, dict[str, float]]:
         """What is read, and what turns columns into units of the SI, for those that need it."""
@@ -976,11 +987,27 @@ class _Reader:
         starts[[row for row in piece.headers if row < piece.rows]] = True
         return starts
 
-    def _sift(self, piece: Piece, anew: Bools, starts: Bools, late: Bools) -> tuple[Bools, Bools]:
+    def _between(self, starts: Bools, rows: NDArray[np.int64], tells: Bools) -> tuple[Bools, Bools]:
+        """Of rows that count which begin an episode, and which failed as one between them tells.
+
+        That is the next one of its episode, else the one before; the first is of a piece before.
+        """
+        counts = np.cumsum(np.append(self._begins, starts))  # episodes
+        there, episodes = np.concatenate([[0], counts[rows + 1], [-1]]), counts[1:][tells]
+        self._begins = counts[-1] > there[-2]
+        place = np.searchsorted(rows, np.flatnonzero(tells)) + 1
+        place -= there[place] != episodes
+        place = place[there[place] == episodes]
+        return np.diff(there[:-1]) > 0, np.isin(np.arange(len(rows) + 1), place)
+
+    def _sift(
+        self, piece: Piece, anew: Bools, starts: Bools, late: Bools, reports: Bools
+    ) -> tuple[Bools, Bools]:
         """Which rows are kept, and which of them fail; marks ``starts`` after those that end one.
 
         An episode begins ``anew`` where the log says so, and at ``starts``. A condition that still
-        holds is no second failure, and a hole in time does not make it one.
+        holds is no second failure, and a hole in time does not make it one. Some rows fail as
+        others say, by ``reports``; the first of these is of the row before.
         """
         columns, failed = self._columns, self._failed
         action = columns.action
@@ -1008,8 +1035,10 @@ class _Reader:
         for term in failed.terms if failed else ():
             if term.of_number and term.column not in self._observed:
                 piece.leave_out(term.column, np.isnan(piece.numbers[term.column]) & ~is_left_out)
+        for term in self._terms:
+            term.leave_out(piece)
         fails = np.zeros(piece.rows, np.bool_)
-        holds = fails if failed is None else failed.holds(piece) & ~nobody
+        holds = fails if failed is None else (failed.holds(piece) | reports[1:]) & ~nobody
         is_kept = ~(is_left_out | piece.bad | late)
         self._failed_before = False
         if failed:
@@ -1017,8 +1046,7 @@ class _Reader:
                 holds[max(row - 1, 0)] |= holds[row]
             for row in np.flatnonzero(late):
                 holds[row] = holds[row - 1] if row else self._held
-            self._noted.failing += int(holds.sum())
-            self._note_compared(piece, failed)
+            self._noted.failing += int(holds.sum() + reports[0])
             before = np.append(self._held, holds[:-1]) & ~anew
             self._held = bool(holds[-1])
             fails, still = holds & ~before, holds & before
@@ -1030,7 +1058,7 @@ class _Reader:
             still |= prior_ends  # it is over
             self._noted.unplaced += int((fails & ~is_kept & ~prior_ends).sum())
             self._noted.after_failure += int((still & is_kept).sum())
-            self._failed_before = bool(prior_ends[0])
+            self._failed_before = bool(prior_ends[0] | (reports[0] & self._kept))
             fails = (fails & is_kept) | np.append(prior_ends[1:], False)
             is_kept &= ~still
         self._noted.elsewhere += int((elsewhere & ~is_incomplete).sum())

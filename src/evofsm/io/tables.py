@@ -359,7 +359,6 @@ class Piece:
             texts={name: texts.gather(rows) for name, texts in self.texts.items()},
             find=lambda row: self.find(int(rows[row])),
             anew=np.searchsorted(rows, self.anew).tolist(),
-            headers=np.searchsorted(rows, self.headers).tolist(),
             cut=self.cut if rows[-1:].tolist() == [self.rows - 1] else "",
         )
         piece.bad[:] = self.bad[rows]
