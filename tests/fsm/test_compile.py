@@ -41,8 +41,8 @@ def package(tmp_path):
     return folder
 
 
-def run(package):
-    environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
+def run(package, cache):
+    environment = {**os.environ, "NUMBA_CACHE_DIR": cache and str(package.with_name(cache))}
     command = [sys.executable, "-m", "compiled.caller"]
     finished = subprocess.run(
         command, cwd=package.parent, env=environment, capture_output=True, text=True, check=True
@@ -52,11 +52,12 @@ def run(package):
 
 
 @pytest.mark.slow
-def test_editing_a_kernel_takes_effect_in_the_kernels_that_call_it(package):
-    assert run(package) == (3.0, 0)
-    assert run(package) == (3.0, 1)  # the second process finds the compiled code
+@pytest.mark.parametrize("cache", ["", "elsewhere"], ids=["beside it", "elsewhere"])
+def test_editing_a_kernel_takes_effect_in_the_kernels_that_call_it(package, cache):
+    assert run(package, cache) == (3.0, 0)
+    assert run(package, cache) == (3.0, 1)  # the second process finds the compiled code
     (package / "callee.py").write_text(CALLEE.replace("FACTOR", "5.0"))
-    assert run(package) == (6.0, 0)
+    assert run(package, cache) == (6.0, 0)
 
 
 WARMED = """

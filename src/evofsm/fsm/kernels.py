@@ -6,10 +6,8 @@ Constants that a kernel uses stand in a file of kernels: so a cache that is out 
 from __future__ import annotations
 
 import logging
-import os
 import re
 from collections.abc import Callable
-from contextlib import suppress
 from functools import cache, partial
 from hashlib import sha256
 from pathlib import Path
@@ -31,14 +29,30 @@ COMPILES = not cast(Any, numba.config).DISABLE_JIT
 _njit: Any = partial(numba.njit, error_model="numpy", no_cfunc_wrapper=True)
 
 
+# Of what is cached: where each kernel's code lies, and for which sources.
+_INDICES: list[Any] = []
+
+
+@cache
+def _all_kernels() -> bytes:
+    """A checksum of all files of kernels: Numba looks at a kernel's own, not at those it calls."""
+    uses = re.compile(rb"\n@(\w*kernel|compiled)\b")
+    paths = filter(Path.is_file, sorted(Path(__file__).parents[1].rglob("*.py")))
+    return sha256(b"".join(filter(uses.search, map(Path.read_bytes, paths)))).digest()
+
+
 def compiled(function: Function, **options: Any) -> Function:
     """Compile with Numba on the first call, and keep the code on disk where there is a place."""
     if not COMPILES:
         return np.errstate(all="ignore")(function)
     try:
-        return cast(Function, _njit(cache=True, **options)(function))
+        dispatcher = _njit(cache=True, **options)(function)
     except RuntimeError:  # neither the package nor the user's cache folder may be written
         return cast(Function, _njit(**options)(function))
+    index = dispatcher._cache._cache_file
+    index._source_stamp = index._source_stamp, _all_kernels()
+    _INDICES.append(index)
+    return cast(Function, dispatcher)
 
 
 def kernel(function: Function) -> Function:
@@ -174,7 +188,7 @@ class _Announcement(event.Listener):
     said = False
 
     def on_start(self, event: object) -> None:
-        if not (self.said or any(Path(__file__).parents[1].rglob("__pycache__/*.nbi"))):
+        if not (self.said or any(index._load_index() for index in _INDICES)):
             _log.warning("compiling kernels, once; this takes some seconds ...")
         self.said = True
 
@@ -185,24 +199,3 @@ class _Announcement(event.Listener):
 def announce_compiling() -> None:
     """From now on, log once (on stderr, unless told otherwise) that kernels are compiled."""
     event.register("numba:compile", _Announcement())
-
-
-def _drop_stale_caches(package: Path) -> None:
-    """Delete cached code where a file of kernels has changed; Numba looks at its own file only."""
-    note = package / "__pycache__" / "kernels.sha256"
-    uses = re.compile(rb"\n@(\w*kernel|compiled)\b")
-    sources = [path.read_bytes() for path in sorted(package.rglob("*.py"))]
-    digest = sha256(b"".join(filter(uses.search, sources))).digest()
-    if note.is_file() and note.read_bytes() == digest:
-        return
-    for path in package.rglob("__pycache__/*.nb[ic]"):
-        path.unlink(missing_ok=True)
-    note.parent.mkdir(exist_ok=True)
-    draft = note.with_name(f"{note.name}.{os.getpid()}")
-    draft.write_bytes(digest)
-    draft.replace(note)
-
-
-# Not possible where the installation may not be written, or another process cleans up too.
-with suppress(OSError):
-    _drop_stale_caches(Path(__file__).parents[1])
