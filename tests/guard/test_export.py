@@ -102,6 +102,7 @@ def test_where_no_macro_tells_of_that_it_decides_nothing(wall, flags, tmp_path):
     [
         *("", "2nd", "_guard", "a-b", "a b", "a__b", "a_", "käfig", "wall\n", "size_t", "../wall"),
         *("int", "class", "constexpr", "restrict", "and", "std", "linux", "Math", "errno", "NAN"),
+        *("Action", "Decision", "Guard", "Observation"),
     ],
 )
 def test_a_prefix_that_is_no_name_is_refused(wall, prefix, tmp_path):
@@ -256,6 +257,7 @@ def test_the_node_for_ros_2_compiles_and_decides(wall, tmp_path):
 def test_tools_load_an_fmu_and_step_it(wall, monkeypatch, tmp_path, caplog, capsys):
     file, guard = tmp_path / "my wall-2.fmu", wall.guard.copy()
     guard.reviser.fallback = Fallback(0.25, "a quarter")
+    monkeypatch.setenv("CC", "cc -O1")
     write_fmu(guard, file)
     assert validate_fmu(str(file)) == []
     told, place = fmpy.read_model_description(file), fmpy.extract(file, tmp_path / "unit")
@@ -278,10 +280,25 @@ def test_tools_load_an_fmu_and_step_it(wall, monkeypatch, tmp_path, caplog, caps
         unit.doStep(0.0, wall.guard.interval)
     unit.doStep(0.0, wall.guard.interval / 3)
     unit.freeInstance()
-    monkeypatch.setenv("CC", "no-such-compiler")
-    write_fmu(wall.guard, file)
-    assert fmpy.supported_platforms(file) == ["c-code"]
-    assert "holds sources alone" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("compiler", "why"),
+    [
+        ("no-such-compiler", "it cannot be started"),
+        ("c'c", "it cannot be started"),
+        ("sh -c 'exit 3'", "it ended with status 3"),
+        ("sh -c 'while [ $1 != -o ]; do shift; done; echo > $2' cc", "it ended with status 0"),
+    ],
+)
+def test_what_a_compiler_does_not_build_for_here_is_no_part_of_an_fmu(
+    wall, compiler, why, monkeypatch, tmp_path, caplog
+):
+    monkeypatch.setenv("CC", compiler)
+    write_fmu(wall.guard, tmp_path / "wall.fmu")
+    assert fmpy.supported_platforms(tmp_path / "wall.fmu") == ["c-code"]
+    text = f"holds sources alone: {compiler} (CC, or cc) built no library that loads here: {why}"
+    assert text in caplog.text
 
 
 @pytest.mark.slow

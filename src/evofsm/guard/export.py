@@ -7,11 +7,14 @@ compiled where a compiler is, with ``fmi2.c`` around it.
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
 import logging
 import math
 import os
 import re
+import shlex
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -44,9 +47,10 @@ _LIBRARIES = {"darwin": "dylib", "win32": "dll"}
 _FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-fvisibility=hidden", "-shared")
 
 
-# What no prefix may be, in small letters: words of C and C++, headers that its file would hide, and
-# what these define.
+# What no prefix may be: names in the class for C++; in small letters, words of C and C++, headers
+# that its file would hide, and what these define.
 _TAKEN = """
+Action Decision Guard Observation
 alignas alignof and and_eq asm auto bitand bitor bool break case catch char class compl concept
 const const_cast consteval constexpr constinit continue co_await co_return co_yield decltype default
 delete do double dynamic_cast else enum explicit export extern false float for friend goto if inline
@@ -79,7 +83,7 @@ def write_c99(guard: Guard, folder: Path, prefix: str = "evofsm") -> None:
     off), nothing was learnt yet by which it could decide, or it was not shown to help.
     """
     is_name = re.fullmatch("[A-Za-z](_?[A-Za-z0-9])*(?<!_t)", prefix)
-    if not is_name or prefix.lower() in _TAKEN.split():
+    if not is_name or {prefix, prefix.lower()} & {*_TAKEN.split()}:
         fault = f"the prefix {prefix!r} begins no name in C and C++, or is one of theirs"
         raise ValueError(f"{fault}: take letters, digits and single _, such as my_guard")
     texts = _texts(guard)
@@ -99,23 +103,29 @@ def write_fmu(guard: Guard, file: Path) -> None:
     """
     name = re.sub(r"^(?=\d)|\W", "_", file.stem, flags=re.ASCII)
     texts, library = _texts(guard, name), f"{name}.{_LIBRARIES.get(sys.platform, 'so')}"
-    with tempfile.TemporaryDirectory() as place, store.replacing(file) as output:
+    open_place = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)  # of what is loaded
+    with open_place as place, store.replacing(file) as output:
         folder = Path(place)
         for file_name, text in texts.items():
             (folder / file_name).write_text(text, "utf-8")
-        with suppress(OSError):  # there is no compiler
-            command = (os.environ.get("CC") or "cc", *_FLAGS, "-o", library)
-            subprocess.run([*command, "evofsm.c", "fmi2.c", "-lm"], cwd=place, check=False)
+        files = [folder / each for each in (library, "evofsm.c", "fmi2.c")]
+        compiler, fault = os.environ.get("CC") or "cc", "it cannot be started"
+        with suppress(OSError, ValueError):
+            words = [compiler] if shutil.which(compiler) else shlex.split(compiler)
+            code = subprocess.run([*words, *_FLAGS, "-o", *files, "-lm"], check=False).returncode
+            fault = f"it ended with status {code}"
+            ctypes.CDLL(str(files[0]))
+            fault = ""
         with zipfile.ZipFile(output, "w", zipfile.ZIP_DEFLATED) as unit:
             unit.write(folder / "modelDescription.xml", "modelDescription.xml")
             for file_name in ("evofsm.h", "evofsm.c", "fmi2.c"):
                 unit.write(folder / file_name, f"sources/{file_name}")
-            if (folder / library).exists():
+            if not fault:
                 binaries = f"binaries/{sys.platform.removesuffix('32')}64"
-                unit.write(folder / library, f"{binaries}/{library}")
+                unit.write(files[0], f"{binaries}/{library}")
             else:
-                note = "%s holds sources alone: no C compiler built it here (cc, CC)"
-                logging.getLogger(__name__).warning(note, file)
+                note = "%s holds sources alone: %s (CC, or cc) built no library that loads here: %s"
+                logging.getLogger(__name__).warning(note, file, compiler, fault)
 
 
 def _texts(guard: Guard, unit: str = "") -> dict[str, str]:
