@@ -2,6 +2,7 @@ import email
 import json
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -49,6 +50,12 @@ def test_importing_loads_nothing_heavy_and_learning_numba_alone():
     learning = "from evofsm import EvolvingFSM\nEvolvingFSM(2).observe([0.0])"
     # Numba itself loads SciPy where it finds it.
     assert modules_after(learning) & HEAVY <= {"numba", "scipy"}
+
+
+def test_where_it_is_packed_without_its_faces_it_is_said_how_to_pack_it(tmp_path):
+    module = shutil.copy(PACKAGE / "__init__.py", tmp_path)
+    with pytest.raises(ImportError, match="pyinstaller --collect-all evofsm"):
+        runpy.run_path(module, run_name="evofsm")
 
 
 @pytest.mark.parametrize(

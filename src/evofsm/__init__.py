@@ -9,4 +9,8 @@ import lazy_loader
 
 __version__ = "0.1.0"
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+try:
+    __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+except ValueError as error:
+    remedy = "pack all of it (pyinstaller --collect-all evofsm), and in no zip"
+    raise ImportError(f"evofsm lacks files that lie beside its modules: {remedy}") from error
