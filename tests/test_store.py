@@ -271,14 +271,26 @@ def test_what_a_killed_process_left_behind_is_swept_and_what_is_being_written_is
     assert sorted(tmp_path.iterdir()) == sorted([path, *others])
 
 
-def test_a_file_keeps_its_mode_and_a_new_one_has_that_of_any_other(tmp_path):
+def test_a_file_keeps_its_mode_and_owner_and_a_new_one_has_those_of_any_other(tmp_path):
     (tmp_path / "other").touch()
     write(tmp_path / "file")
     assert (tmp_path / "file").stat().st_mode == (tmp_path / "other").stat().st_mode
     for mode in (0o600, 0o640, 0o444):
         (tmp_path / "file").chmod(mode)
+        if os.geteuid() == 0:  # no one else may give a file away
+            os.chown(tmp_path / "file", 12, 34)
+        before = (tmp_path / "file").stat()
         write(tmp_path / "file")
-        assert stat.S_IMODE((tmp_path / "file").stat().st_mode) == mode
+        after = (tmp_path / "file").stat()
+        assert stat.S_IMODE(after.st_mode) == mode
+        assert (after.st_mode, after.st_uid, after.st_gid) == before[:1] + before[4:6]
+
+
+@pytest.mark.parametrize("letter", ["x", "ä", "\N{HAMMER AND WRENCH}"])
+def test_a_name_may_be_as_long_as_the_system_has_it(tmp_path, letter):
+    name = letter * (255 // len(letter.encode()))
+    write(tmp_path / name)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
 def test_a_link_stays_and_what_it_leads_to_is_replaced(tmp_path):

@@ -58,6 +58,8 @@ _TYPES = {"BOOL": np.bool_, "U8": np.uint8, "I64": np.int64, "F64": np.float64}
 _TYPE_NAMES = {np.dtype(kind): name for name, kind in _TYPES.items()}
 # Nobody writes a file any more that did not change for so long [s].
 _OLD = 600.0
+# So much of a name stands in that of what is written beside it: of 255 bytes, at four a letter.
+_NAMED = 56
 # Why no file can take the place of another one.
 _IRREPLACEABLE = (errno.EBUSY, errno.EXDEV, errno.EACCES, errno.EPERM, errno.EROFS)
 # What reading a damaged file may run into (RuntimeError: JSON that is nested too deep).
@@ -194,31 +196,35 @@ def _sha256(head: bytes, numbers: bytes) -> str:
 def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """A file, open for writing and reading, that takes its place once it is whole and on the disk.
 
-    The last one to end stays. A link is followed, and the mode of a file that was there is kept.
+    The last one to end stays. A link is followed, and the mode of a file that was there is kept, as
+    are its owner and its group where whoever writes may give them.
     What processes that were killed have left beside it is removed.
     Where it cannot be written, an OSError names the file, and what was there is as it was.
 
     No file can take the place of one that is mounted on its own, or whose folder may not be
     written: what is whole is then written over it, and a warning says so.
     """
-    target, mode = _place_of(path)
-    beside = mode is None or os.access(target.parent, os.W_OK)
+    target, before = _place_of(path)
+    beside = before is None or os.access(target.parent, os.W_OK)
     folder = target.parent if beside else Path(gettempdir())
-    temporary = folder / f".{target.name}.{secrets.token_hex(8)}.part"
-    opener = partial(os.open, mode=0o666 if mode is None else 0o600)
+    temporary = folder / f".{target.name[:_NAMED]}.{secrets.token_hex(8)}.part"
+    opener = partial(os.open, mode=0o666 if before is None else 0o600)
     try:
         with open(temporary, "x+b", opener=opener) as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
-            if mode is not None:
-                os.chmod(temporary, mode)
+            if before is not None:
+                os.chmod(temporary, stat.S_IMODE(before.st_mode))
+                for owner, group in ((-1, before.st_gid), (before.st_uid, -1)):
+                    with suppress(OSError, AttributeError):  # no system but POSIX has owners
+                        os.chown(temporary, owner, group)
             if os.name == "nt":  # where an open file cannot be renamed
                 file.close()
             try:
                 os.replace(temporary, target)
             except OSError as error:
-                if mode is None or error.errno not in _IRREPLACEABLE:
+                if before is None or error.errno not in _IRREPLACEABLE:
                     raise
                 _write_over(target, file)
                 temporary.unlink()
@@ -261,26 +267,26 @@ def _write_over(target: Path, whole: BinaryIO) -> None:
             raise
 
 
-def _place_of(path: str | os.PathLike[str]) -> tuple[Path, int | None]:
-    """Where a file is once links are followed, and its mode; None where there is none yet."""
+def _place_of(path: str | os.PathLike[str]) -> tuple[Path, os.stat_result | None]:
+    """Where a file is once links are followed, and of whom; None where there is none yet."""
     file_path = Path(path)
     if not file_path.parent.is_dir():
         raise FileNotFoundError(f"{file_path}: there is no folder {file_path.parent}")
     target = Path(os.path.realpath(file_path))
     try:
-        mode = os.stat(file_path).st_mode
+        before = os.stat(file_path)
     except FileNotFoundError:
         return target, None
-    if not stat.S_ISREG(mode):
-        type_name = "a folder" if stat.S_ISDIR(mode) else "a device, a pipe or a socket"
+    if not stat.S_ISREG(before.st_mode):
+        type_name = "a folder" if stat.S_ISDIR(before.st_mode) else "a device, a pipe or a socket"
         raise OSError(f"{file_path} is {type_name}, which no file may take the place of")
-    return target, stat.S_IMODE(mode)
+    return target, before
 
 
 def sweep(path: str | os.PathLike[str]) -> None:
     """Remove what processes that were killed while they wrote a file have left beside it."""
     target = Path(os.path.realpath(path))
-    pattern = re.compile(rf"\.{re.escape(target.name)}\.[0-9a-f]{{16}}\.part")
+    pattern = re.compile(rf"\.{re.escape(target.name[:_NAMED])}\.[0-9a-f]{{16}}\.part")
     with suppress(OSError):
         for beside in target.parent.iterdir():
             if pattern.fullmatch(beside.name) and time.time() - beside.stat().st_mtime > _OLD:
