@@ -8,6 +8,8 @@ from evofsm.extras import refuse_without_command_line
 
 def main() -> None:
     """Run the command line."""
+    if sys.stdout is None:  # closed: answers that nobody can read are none
+        sys.stdout = os.fdopen(os.open(os.devnull, os.O_RDONLY))
     if sys.stderr is None:  # closed: notices are no answers
         sys.stderr = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
     try:

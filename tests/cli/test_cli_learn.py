@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import random
 import re
 from unittest.mock import Mock
@@ -258,7 +259,7 @@ def test_what_no_action_tried_is_said_and_of_one_that_never_moved_there_is_no_gu
 # -- What goes wrong ------------------------------------------------------------------------------
 
 
-def test_files_that_are_none_end_with_one_line(evofsm, refused, log, tmp_path):
+def test_files_that_are_none_end_with_one_line(evofsm, refused, log, tmp_path, monkeypatch):
     assert refused("learn", "nosuch.csv") == "evofsm: nosuch.csv: no such file or directory"
     assert refused("inspect", "nosuch") == "evofsm: nosuch: no such file or directory"
     assert "is a folder" in refused("learn", tmp_path)
@@ -267,6 +268,12 @@ def test_files_that_are_none_end_with_one_line(evofsm, refused, log, tmp_path):
     before = log.read_bytes()
     assert "is no file of evofsm; it was left alone" in refused("learn", log, "--out", log)
     assert log.read_bytes() == before
+    os.mkfifo(tmp_path / "pipe")  # to open it would wait for whoever writes
+    assert "pipe is a device, a pipe" in refused("learn", log, "--out", tmp_path / "pipe")
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert "the folder that this runs in is not there" in refused("learn", log, "--out", "model")
 
 
 def test_ctrl_c_says_so_and_saves_nothing(evofsm, log, tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Callable
-from io import TextIOWrapper
+from io import TextIOWrapper, UnsupportedOperation
 from typing import Annotated, Any
 
 import typer
@@ -53,6 +53,10 @@ def _message(error: BaseException) -> str:
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         folder = "; name a folder" * isinstance(error, FileExistsError)  # that was to be made
         text = f"{error.filename}: {error.strerror.lower()}{folder}"
+    elif isinstance(error, FileNotFoundError) and error.errno:
+        text = "the folder that this runs in is not there any more"
+    elif isinstance(error, UnsupportedOperation):
+        text = "standard output is closed"
     return " ".join(", ".join([text, *getattr(error, "__notes__", ())]).split())
 
 

@@ -364,6 +364,8 @@ def check_out(out: Path | None, kind: str, option: str = "--out") -> None:
     if out.is_dir():
         raise IsADirectoryError(f"{option} {out} is a folder; name a file in it")
     if out.exists():
+        if not out.is_file():
+            raise OSError(f"{option} {out} is a device, a pipe or a socket; name a file")
         try:
             content = f"holds a {store.read_header(out).kind}"
         except (ValueError, OSError):  # so are ours called, whatever wrote them: .evofsm

@@ -276,7 +276,7 @@ def transport_of(
         return ZenohTransport(zenoh), f"listens to {zenoh}/row"
     if file is None and sys.stdin is None:
         raise ValueError("standard input is closed; give FILE, --socket or --zenoh")
-    if sys.stdout is None:
+    if not sys.stdout.writable():  # it is closed
         raise ValueError("standard output is closed; give --socket or --zenoh")
     source = sys.stdin.buffer if file is None else stack.enter_context(file.open("rb"))
     return Stream(source, sys.stdout.buffer), f"reads {file or 'standard input'}"
