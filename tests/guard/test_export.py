@@ -269,7 +269,7 @@ def test_tools_load_an_fmu_and_step_it(wall, monkeypatch, tmp_path, caplog, caps
         unit.doStep(0.0, wall.guard.interval / 3)
         assert unit.getBoolean([6]) == [True]
         unit.setReal([2], [0.0])
-    for value, step, why in ((0.0, 0.07, "a step has to"), (math.inf, 0.1, "is infinite")):
+    for value, step, why in ((0.0, 0.07, "a step of 0.07 s"), (math.inf, 0.1, "is infinite")):
         unit.setReal([0], [value])
         with pytest.raises(FMICallException):
             unit.doStep(0.0, step)

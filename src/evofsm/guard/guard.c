@@ -375,10 +375,10 @@ typedef struct {
   char name[128];
 } unit;
 
-static fmi2Status fail(const unit *of, const char *message) {
+static fmi2Status fail(const unit *of, const char *message, double number) {
   if (of->callbacks.logger != NULL) {
-    of->callbacks.logger(of->callbacks.environment, of->name, fmi2Error, "logStatusError", "%s",
-                         message);
+    of->callbacks.logger(of->callbacks.environment, of->name, fmi2Error, "logStatusError", message,
+                         number);
   }
   return fmi2Error;
 }
@@ -411,7 +411,7 @@ EXPORT void *fmi2Instantiate(const char *name, int kind, const char *guid, const
   of->callbacks = *callbacks;
   snprintf(of->name, sizeof of->name, "%s", name);
   if (kind != 1 || strcmp(guid, "UNIT_GUID") != 0) {
-    fail(of, kind != 1 ? "this unit is for co-simulation" : "modelDescription.xml is of another one");
+    fail(of, kind != 1 ? "it is for co-simulation" : "modelDescription.xml is of another one", 0.0);
     free(of);
     return NULL;
   }
@@ -439,7 +439,7 @@ EXPORT fmi2Status fmi2DoStep(void *c, double time, double step, int no_return) {
   int i, rc;
   if (!(steps >= 1.0) || !(fabs(steps * step / EVOFSM_INTERVAL - 1.0) <= 1e-6) ||
       fabs(left - 0.5) < 0.499) {
-    return fail(of, "a step has to divide the interval (stepSize), and to end with it at the latest");
+    return fail(of, "a step of %g s does not divide the interval of UNIT_STEP s, or ends after it", step);
   }
   if (left > 0.5) {
     of->wait -= step;
@@ -447,7 +447,7 @@ EXPORT fmi2Status fmi2DoStep(void *c, double time, double step, int no_return) {
   }
   rc = evofsm_decide(&of->state, of->values, proposal, &decision);
   if (rc != EVOFSM_OK) {
-    return fail(of, why[rc]);
+    return fail(of, why[rc], 0.0);
   }
   of->wait = EVOFSM_INTERVAL - step;
   of->values[RISK] = decision.risk_executed;
@@ -466,7 +466,7 @@ EXPORT fmi2Status fmi2DoStep(void *c, double time, double step, int no_return) {
     for (i = 0; i < count; i++) {                                                            \
       double *const value = ((unit *)c)->values + at[i];                                     \
       if (at[i] >= (last)) {                                                                 \
-        return fail(c, "there is no such variable, or none that can be set");                \
+        return fail(c, "there is no variable %g, or it cannot be set", at[i]);               \
       }                                                                                      \
       copy;                                                                                  \
     }                                                                                        \
