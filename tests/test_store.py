@@ -184,7 +184,7 @@ HARMFUL = {
     "newer": (header_with(version=2), "version 2 is newer than this library's 1; a newer evofsm"),
     "settings of none": (header_with(settings=None), "does not say what it holds"),
     "more in the header": (header_with(pickle="cos"), "its header does not say what it"),
-    "more of an array": (array_with("values", pickle="cos"), "its header is none that evofsm"),
+    "more of an array": (array_with("values", pickle="cos"), "writes .* not round to nearest"),
     "what no terminal is to see": (
         lambda told, entries, _: entries.update({"\x1b[2J": entries.pop("note")}),
         r"it has \\x1b\[2J, which no draws has",

@@ -338,7 +338,8 @@ def read(place: Place, kind: Kind) -> tuple[dict[str, Any], dict[str, NDArray[An
             is_ours = False
         # Of the ways to write it, only one is `write`'s; the numbers fill it.
         if not is_ours or sum(array.nbytes for array in arrays.values()) != len(numbers):
-            raise ValueError("its header is none that evofsm writes")
+            cause = "does this process not round to nearest?"
+            raise ValueError(f"its header is none that evofsm writes ({cause})")
         _refuse_unfit(kind, header.settings, arrays)
     return header.settings, arrays
 

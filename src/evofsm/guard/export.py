@@ -108,7 +108,7 @@ def write_fmu(guard: Guard, file: Path) -> None:
         folder = Path(place)
         for file_name, text in texts.items():
             (folder / file_name).write_text(text, "utf-8")
-        files = [folder / each for each in (library, "evofsm.c", "fmi2.c")]
+        files = [folder / part for part in (library, "evofsm.c", "fmi2.c")]
         compiler, fault = os.environ.get("CC") or "cc", "it cannot be started"
         with suppress(OSError, ValueError):
             words = [compiler] if shutil.which(compiler) else shlex.split(compiler)
