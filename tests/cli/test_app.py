@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from evofsm import EvolvingFSM
 from evofsm.cli import options
 from evofsm.extras import OF_COMMANDS
 
@@ -37,19 +36,6 @@ def test_control_c_while_it_is_loaded_is_one_line():
         "builtins.__import__ = stop\nprogram.main()"
     )
     assert (result.returncode, result.stderr) == (130, "evofsm: stopped before the end\n")
-
-
-@pytest.mark.slow
-def test_an_answer_that_nobody_can_read_is_no_success(tmp_path):
-    machine = EvolvingFSM(2)
-    machine.learn_many([[0.0], [1.0]], [0, 0])
-    machine.save(tmp_path / "model")
-    result = python(
-        "import sys; sys.stdout = None\n"
-        f"sys.argv = ['evofsm', 'export', {str(tmp_path / 'model')!r}, '--to', 'dot']\n"
-        "from evofsm.__main__ import main\nmain()"
-    )
-    assert (result.returncode, result.stderr) == (2, "evofsm: standard output is closed\n")
 
 
 def test_all_that_a_command_lacks_is_named_at_once(evofsm, monkeypatch):

@@ -288,9 +288,11 @@ def test_however_it_ends_it_goes_on_bit_for_bit(tmp_path):
 @posix
 @pytest.mark.slow
 def test_streams_that_are_closed_or_do_not_wait_end_it_in_a_line_or_not_at_all():
-    base = shlex.join([sys.executable, "-m", "evofsm", "monitor"])
-    for closed, name in (("<&-", "input"), (">&-", "output")):
-        done = subprocess.run(f"{base} {closed}", shell=True, capture_output=True, text=True)
+    program = shlex.join([sys.executable, "-m", "evofsm"])
+    base, another = f"{program} monitor", f"{program} check evofsm.fsm:Novelty"
+    closed = {f"{base} <&-": "input", f"{base} >&-": "output", f"{another} >&-": "output"}
+    for command, name in closed.items():
+        done = subprocess.run(command, shell=True, capture_output=True, text=True)
         assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
         assert f"standard {name} is closed" in done.stderr
     done = subprocess.run(f"{base} 2>&-", shell=True, capture_output=True, input=ROWS[0])
