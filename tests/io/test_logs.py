@@ -652,15 +652,16 @@ def test_rows_that_are_not_chosen_end_an_episode_in_failure_if_it_begins_with_th
         ("x>3.5 or u<1", [3]),
         ("Status=='a or b' or x>=7", [6]),
         ("Status==nothing", []),
+        ("Status=='NA'", [1]),
     ],
 )
 def test_conditions_may_compare_texts_and_be_joined(tmp_path, condition, fails):
-    noted = Noted()
-    ((_, values, *_, failed), *_) = taken(tmp_path, STOPS, noted, failed=condition)
+    rows, noted = [STOPS[0], "1 2 9 NA", *STOPS[2:]], Noted()
+    ((_, values, *_, failed), *_) = taken(tmp_path, rows, noted, failed=condition)
     assert (failed, len(values)) == (fails, fails[0] + 1 if fails else 7)
     columns = LogColumns(failed=condition)
     said = [one for one in warnings_of(noted, columns) if "no row meets" in one]
-    assert said == [] if fails else said[0].endswith("Status is 'off', 'on'")
+    assert said == [] if fails else said[0].endswith("Status is 'NA', 'off', 'on'")
 
 
 # -- Dates and units -------------------------------------------------------------------------------

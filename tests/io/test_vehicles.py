@@ -240,11 +240,12 @@ def test_who_comes_towards_one_is_nobody_s_leader(tmp_path):
         "timestep_time;person_{};a;b;c;d",  # it names them after what it writes first
     ],
 )
-def test_columns_of_fcd_may_be_called_as_sumo_likes(tmp_path, header):
+@pytest.mark.parametrize("nothing", ["", "NaN", "NA", "NULL", "None"])
+def test_columns_of_fcd_may_be_called_as_sumo_likes(tmp_path, header, nothing):
     first, rest = header.split("{}")
     names = ";".join(first.split(";")[-1] + name for name in ("id", "lane", "pos", "speed"))
     rows = [f"{t};{name};e;{at};5;;;;" for t in (0, 1) for name, at in (("a", 50), ("b", 20))]
-    rows.insert(2, "0;;;;;walker;3;1;")
+    rows[2:2] = [f"0;{who};{nothing};9;{nothing};walker;3;1;" for who in "cd"]
     text = "\n".join([f"{first.split(';')[0]};{names}{rest}", *rows, ""])
     ((observations, _, _),) = episodes(write(tmp_path / "a.csv", text))
     assert observations.tolist() == [[25.0, 5.0, 5.0]] * 2
@@ -319,7 +320,7 @@ def test_the_leader_is_the_nearest_one_ahead_on_the_same_lane(tmp_path):
         t = 0.1 * k
         rows += [("ego", t, 2 * k, 0, 20 - k, 0, 4, 1), ("beside", t, 8, 4, 11, 0, 4, 2)]
         rows += [("far", t, 60 + k, 0, 12, 0, 4, 1), ("near", t, 30 + k, 0, 13, 0, 6, 1)]
-        rows += [("off the road", t, 10, 0, 14, 0, 4, ""), ("sign", t, "", "nan", "", 0, 0, "")]
+        rows += [("off the road", t, 10, 0, 14, 0, 4, "NA"), ("sign", t, "", "nan", "", 0, 0, "")]
     path = objects(tmp_path / "a.csv", rows)
     found = sorted(episodes(path), key=lambda one: one[0][0, 1])
     assert [len(times) for _, _, times in found] == [3, 3]
@@ -327,7 +328,9 @@ def test_the_leader_is_the_nearest_one_ahead_on_the_same_lane(tmp_path):
     assert found[1][0].tolist() == [[25.0, 20.0, 13.0], [24.0, 19.0, 13.0], [23.0, 18.0, 13.0]]
     assert found[1][1][:2] == pytest.approx([-10.0, -10.0])
     numbers = dict.fromkeys(("x", "y", "vx"), polars.Float64)
-    polars.read_csv(path, schema_overrides=numbers).write_parquet(tmp_path / "a.parquet")
+    table = polars.read_csv(path, schema_overrides=numbers)
+    table = table.with_columns(polars.col("lane").cast(float, strict=False).fill_null(math.nan))
+    table.write_parquet(tmp_path / "a.parquet")
     again = sorted(episodes(tmp_path / "a.parquet"), key=lambda one: one[0][0, 1])
     assert again[1][0].tolist() == found[1][0].tolist()
 

@@ -201,7 +201,8 @@ def _first_rows(
     if not len(frame):
         return frame, clock, form
     for name in texts:  # of which the first alone is no number
-        fields = frame[name].str.strip_chars().replace("", None)
+        fields = frame[name].str.strip_chars()
+        fields = fields.set(fields.str.to_lowercase().is_in(tables.MISSING), None)
         floats = fields.str.replace(",", ".", literal=True).cast(polars.Float64, strict=False)
         bad = fields.filter(floats.is_null() & fields.is_not_null())
         if floats.n_unique() > _MOST_TEXTS and 2 * len(bad) < len(fields.drop_nulls()):
@@ -390,7 +391,7 @@ def _rare(frame: polars.DataFrame, columns: Sequence[str]) -> Iterator[tuple[str
         )
         for kind in kinds if is_code and len(kinds) <= _MOST_TEXTS else ():
             here = (frame[name] == kind).to_numpy()
-            if kind and here.mean() < 0.25:
+            if kind and str(kind).lower() not in tables.MISSING and here.mean() < 0.25:
                 first = np.flatnonzero(here > np.append(False, here[:-1]))
                 text = f"{kind:g}" if is_number else kind
                 value = text if is_number or re.fullmatch(r"[^\W\d]\w*", text) else f"'{text}'"

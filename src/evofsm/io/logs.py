@@ -23,7 +23,7 @@ from evofsm.fsm.naming import in_a_line
 from evofsm.fsm.observations import Category, ObservationEncoder
 from evofsm.guard.foresight import DATES
 from evofsm.io import tables, vehicles
-from evofsm.io.tables import Piece, Skips, Table, Wanted, is_number
+from evofsm.io.tables import MISSING, Piece, Skips, Table, Wanted, is_number
 from evofsm.io.vehicles import ACTION, PairTable, VehicleLengths
 
 if TYPE_CHECKING:
@@ -71,6 +71,7 @@ _OUTSIDE = r"""(?=(?:[^"']|"[^"]*"|'[^']*')*$)"""
 _OR, _AND = (re.compile(rf"\s+{word}\s+{_OUTSIDE}") for word in ("or", "and"))
 _SIGNS = {"<=": operator.le, ">=": operator.ge, "<": operator.lt, ">": operator.gt}
 _SIGNS |= {"==": operator.eq, "!=": operator.ne}
+_NO_TEXT = {*MISSING} - {"none"}  # which may be a state of its own
 _TRUTHS = dict.fromkeys(("true", "yes", "1", "1.0"), True)
 _TRUTHS |= dict.fromkeys(("false", "no", "0", "0.0"), False)
 
@@ -252,7 +253,7 @@ class Term(NamedTuple):
 
     def fault(self, value: Any) -> str:
         """Why it cannot be told of one value, if that is so."""
-        if value is None or value == "" or self.truth_of(value) is not None:
+        if self._there(value) is None or self.truth_of(value) is not None:
             return ""
         if not self.sign:
             return f"is {value!r}; it must be a truth value: true and false, 1 and 0, yes and no"
@@ -261,12 +262,18 @@ class Term(NamedTuple):
 
     def truth_of(self, value: Any) -> bool | None:
         """Whether it holds of one value; None of nothing, and of what it cannot be told of."""
-        value = value.strip() if isinstance(value, str) else value
+        value = self._there(value)
         if not self.sign:
             return _TRUTHS.get(str(value).lower())
-        if value in (None, "") or isinstance(value, str) == self.of_number:
+        if value is None or isinstance(value, str) == self.of_number:
             return None
         return bool(_SIGNS[self.sign](value, self.value))
+
+    def _there(self, value: Any) -> Any:
+        """What stands in a field, if anything does; what is compared with always does."""
+        text = value.strip() if isinstance(value, str) else value
+        is_nothing = str(text).lower() in _NO_TEXT and text != self.value
+        return None if is_nothing else text
 
 
 class Condition(NamedTuple):

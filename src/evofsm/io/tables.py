@@ -79,7 +79,7 @@ _SPELT = {"kmh": "km/h", "kph": "km/h", "kmph": "km/h", "km/hr": "km/h", "mps": 
 _SPELT |= {"day": "d", "days": "d"}
 _SPELT |= {"\u00b5s": "us", "\u03bcs": "us", "knots": "kn", "kt": "kn", "m/s/s": "m/s2"}
 _COMMENT = re.compile(r"\A\s*(#|%|//)+\s*")  # what stands before the last line of a comment
-MISSING = ("", "na", "n/a", "null", "none")  #: what stands in a field where there is no number
+MISSING = ("", "na", "n/a", "nan", "null", "none")  #: what stands in a field where nothing does
 # By which a comma is known to be a decimal one; groups of three digits it may separate as well.
 _DECIMAL_COMMA = re.compile(r"\s*-?\d+,(\d\d?|\d{4,})\s*")
 _CONTROL = re.compile(rb"[\0-\x08\x0e-\x1f]")  # what no text holds

@@ -25,7 +25,7 @@ from evofsm.driving.naming import VARIABLES
 from evofsm.driving.rehearsal import Three
 from evofsm.extras import needs
 from evofsm.io import tables
-from evofsm.io.tables import Piece, Skips, Source, Table, Wanted, explained, in_row
+from evofsm.io.tables import MISSING, Piece, Skips, Source, Table, Wanted, explained, in_row
 from evofsm.store import LARGEST_OBSERVATION
 
 ACTION = "a_follower"  #: of a pair of vehicles: what the follower did until the next time
@@ -109,7 +109,7 @@ class PairTable(Table):
         before, headings, has_lanes = -math.inf, dict[str, complex](), False
         for time, where, entries in self.moments:
             try:  # persons, and vehicles off the road, have no lane
-                cars = [vehicle_of(*entry) for entry in entries if entry[1].get("lane")]
+                cars = [vehicle_of(*entry) for entry in entries if _is_on_lane(entry[1])]
             except ValueError as error:  # without one of them, others would be taken for pairs
                 self.skips.leave_out("timestep", str(error))
                 continue
@@ -188,6 +188,10 @@ class PairTable(Table):
                         self.lengths.overlaps[leader.kind] += 1
                     yield (car.name, leader.name), (gap, car.speed, leader.speed)
                     break
+
+
+def _is_on_lane(told: Mapping[str, Any]) -> bool:
+    return str(told.get("lane") or "").strip().lower() not in MISSING
 
 
 def _ahead(

@@ -232,7 +232,7 @@ class CsvRows:
 
     def _number(self, name: str, text: str, dialect: Dialect) -> float | None:
         """What stands in a field, in units of the SI; None where nothing does."""
-        if text.lower().removeprefix("-") in (*tables.MISSING, "nan"):
+        if text.lower().removeprefix("-") in tables.MISSING:
             return None
         if not is_number(plain := text.replace(",", ".") if dialect.has_commas else text):
             raise MessageError(name, explained(text))
