@@ -202,6 +202,22 @@ def test_who_is_beside_is_nobody_s_leader_in_fcd(tmp_path, told, ending):
     assert "is it narrower than 2.5 m? --vehicle-length bike=12x0.8" in " ".join(warnings_of(noted))
 
 
+@pytest.mark.parametrize("told", [{}, {"posLat": 0.0}])
+def test_who_parks_beside_the_road_is_nobody_s_leader_until_it_is_back(tmp_path, told):
+    road = {}
+    for k, beside in enumerate([0.0, 3.2, 3.2, 3.2, 3.2, 0.0, 0.0]):
+        places = [("van", 100.0, beside, 0.0), ("car", 10.0 + 20 * k, 0.0, 20.0)]
+        names = *FIELDS[:4], "x", "y"
+        road[k] = [
+            dict(zip(names, (n, "e", x, v, x, y), strict=True)) | told for n, x, y, v in places
+        ]
+    found = episodes(write(tmp_path / "a.xml", xml(road)))
+    assert [(times.tolist(), rows[0].tolist()) for rows, _, times in found] == [
+        ([0.0], [85.0, 20.0, 0.0]),
+        ([5.0, 6.0], [5.0, 0.0, 20.0]),
+    ]
+
+
 @pytest.mark.parametrize("turned", [0.7, math.pi, -2.0])
 def test_who_is_beside_is_nobody_s_leader_among_objects(tmp_path, turned):
     rows = [

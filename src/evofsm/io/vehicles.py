@@ -70,6 +70,8 @@ class Vehicle(NamedTuple):
 
 #: Time [s], where it stands, and all that is there then: where, and what stands there by its name.
 Moment = tuple[float, Place, list[tuple[Place, Mapping[str, Any]]]]
+#: Where a vehicle was: its heading, lanes and places in the plane and along; whether it parks.
+_Track = tuple[complex, Sequence[str], complex, float, bool]
 _Pair = tuple[str, str]  #: follower and leader, on whichever lane
 
 
@@ -106,7 +108,7 @@ class PairTable(Table):
         """Rows of a pair for as long as it stays one, or until too many wait."""
         open_pairs: dict[_Pair, array[float]] = {}
         vehicle_of = _object if self.lengths is None else partial(_car, self.lengths)
-        before, headings, has_lanes = -math.inf, dict[str, complex](), False
+        before, tracks, has_lanes = -math.inf, dict[str, _Track](), False
         for time, where, entries in self.moments:
             try:  # persons, and vehicles off the road, have no lane
                 cars = [vehicle_of(*entry) for entry in entries if _is_on_lane(entry[1])]
@@ -114,7 +116,7 @@ class PairTable(Table):
                 self.skips.leave_out("timestep", str(error))
                 continue
             has_lanes = has_lanes or bool(cars)
-            lanes = self._lanes(time, cars, headings)
+            lanes = self._lanes(time, cars, tracks)
             if not time > before:
                 cause = "rows not sorted by time, or two recordings in one file?"
                 fault = f"time goes from {before:g} to {time:g}; it must run forward ({cause})"
@@ -140,9 +142,12 @@ class PairTable(Table):
             self.skips.refuse_nothing(self.path + (_NO_OBJECT if self.lengths is None else _NO_CAR))
 
     def _lanes(
-        self, time: float, cars: Iterable[Vehicle], headings: dict[str, complex]
+        self, time: float, cars: Iterable[Vehicle], tracks: dict[str, _Track]
     ) -> Iterable[list[Vehicle]]:
-        """Who is on each lane, once; who does not say where it points does so as before."""
+        """Who is on each lane, once; who does not say where it points does so as before.
+
+        SUMO puts who parks beside the road there at once, and only the plane tells.
+        """
         lanes: defaultdict[str, list[Vehicle]] = defaultdict(list)
         names = set[str]()
         for car in cars:
@@ -152,10 +157,15 @@ class PairTable(Table):
                 self.skips.leave_out("twice", why)
                 continue
             names.add(car.name)
+            here = car.heading, car.lanes, car.place, car.along, False
+            heading, ways, place, along, parks = tracks.get(car.name, here)
             if car.heading != car.heading:
-                car = car._replace(heading=headings.get(car.name, car.heading))
-            headings[car.name] = car.heading
-            for lane in dict.fromkeys(car.lanes):
+                car = car._replace(heading=heading)
+            aside = abs(car.place - place) - 2.0 * abs(car.along - along)
+            jumps = aside > _USUAL_WIDTH and car.lanes == ways
+            parks = car.speed < _TURNS_ABOVE and parks != jumps
+            tracks[car.name] = car.heading, *here[1:4], parks
+            for lane in dict.fromkeys(() if parks else car.lanes):
                 lanes[lane].append(car)
         return [lanes[name] for name in sorted(lanes)] if self.lengths else lanes.values()
 
