@@ -35,6 +35,7 @@ _NEAR = 3  # rows before a failure that are never proposed to be left out
 # A larger share of steps, and so many, that are no usual one make no clock; of bad rows no log.
 _ODD, _MANY, _MANY_BAD = 0.001, 10, 0.05
 _TIME = re.compile(r"ts?[\W_]*([mun]?s)?\W*$|(time|zeit|timestamp|sec|epoch)([^a-z]|$)", re.I)
+_CLOCK = re.compile("times?|timestamps?|stamps?|sec(ond)?s?|epoch|elapsed|zeit(stempel)?", re.I)
 _FRAME = re.compile("frame([^a-z]|$)", re.IGNORECASE)  # it counts steps of the same length
 # Other dates: the year first, or the day or the month, which may be a name.
 _OTHER = re.compile(r"(\d+)([/ -])(\w+)\2(\d{2,4})(,? )\d\d?:\d\d(:\d\d(\.\d+)?)?( [AP]M)?$", re.I)
@@ -136,7 +137,16 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     options += [("--unit", form)] if form and not counts else []
     bad = sum(n for n, _ in skips.values()) + sum(odd.values())
     if not counts:
-        further, n_late = _of_steps(frame[clock].to_numpy()[order], segments, facts, n_partial)
+        at = frame[clock].to_numpy()[order]
+        there = {name: np.isfinite(z[order]) for name, z in values.items()}
+        there = {name: rows for name, rows in there.items() if rows.sum() > _MANY}
+        if there and not np.logical_and.reduce([*there.values()]).any():  # of several clocks
+            age = max(float(np.median(np.diff(at[rows]))) for rows in there.values())
+            hold = next((nice for nice, _ in _NICE if nice >= 3.0 * age), _NICE[-1][0])
+            options.append(("--hold", f"{hold:g}"))
+            rows = there[next(filter(_is_set, there), next(iter(there)))]
+            at, segments, n_partial = at[rows], segments[rows], 0
+        further, n_late = _of_steps(at, segments, facts, n_partial)
         options, bad = options + further, bad + n_late
     bad = max(bad, n_partial * ("--resample" not in dict(options)))  # there they cost nothing else
     if bad > max(SKIPPED, _MANY_BAD * len(frame)):
@@ -187,9 +197,14 @@ def _first_rows(
     """Their columns, the clock in seconds, which one that is, and how it is written if oddly."""
     firsts = {name: table.first(name).strip() for name in table.columns if table.holds(name)}
     pairs = [*zip(firsts, [*firsts][1:], strict=False)]
-    together = (f"{a},{b}" for a, b in pairs if is_date(f"{firsts[a]} {firsts[b]}"))
     date_columns = [name for name, text in firsts.items() if is_date(text)]
-    clock, form = next(iter(date_columns), "") or next(together, ""), ""
+    apart = (pair for pair in pairs if pair[0] not in date_columns)
+    together = (f"{a},{b}" for a, b in apart if is_date(f"{firsts[a]} {firsts[b]}"))
+    early = next(table.pieces(Wanted([], date_columns))).texts if date_columns else {}
+    table.skips.kinds.clear()  # said where all rows are read
+    # A date that stays is that of the export.
+    changing = (name for name, dates in early.items() if dates.n_unique() > 1)
+    clock, form = next(changing, "") or next(together, ""), ""
     dates = clock.split(",") if clock else []
     numbers = [name for name in firsts if table.holds(name) == "number"]
     texts = [name for name in firsts if name not in {*numbers, *date_columns, *dates}]
@@ -251,7 +266,11 @@ def _clock_of(frame: polars.DataFrame, names: Sequence[str]) -> tuple[str, str, 
     for name in (*filter(_TIME.match, epochs), *epochs):
         since = {"d": "1899-12-30, as Excel has it"}.get(epochs[name], "1970")
         return name, epochs[name], f", {epochs[name]} since {since}"
-    clock = next((n for like in (_TIME, _FRAME) for n in filter(like.match, names)), "")
+    named = [name for name in names if any(map(_CLOCK.fullmatch, _WORDS.findall(name)))]
+    signs = ((name, np.sign(np.diff(frame[name].drop_nans().to_numpy()))) for name in named)
+    runs = [name for name, sign in signs if sign.sum() > 0.8 * abs(sign).sum() > 0.0]
+    clocks = *filter(_TIME.match, names), *runs, *filter(_FRAME.match, names)
+    clock = next((name for name in clocks if frame[name].drop_nans().n_unique() > 1), "")
     most = float(str(frame[clock].abs().max())) if clock else 0.0
     return clock, next((unit for unit, n in _EPOCHS.items() if most > 1e8 * n), "s"), ""
 
@@ -263,7 +282,7 @@ def _dates(
     texts = frame[names[0]].str.strip_chars()
     for name in names[1:]:
         texts = texts + " " + frame[name].str.strip_chars()
-    if not (match := _OTHER.match(str(texts[0]))):
+    if not (match := _OTHER.match(str(texts[0]))) or texts.n_unique() < 2:
         return None
     first, sign, second, third, space, has_seconds, has_parts, half = match.groups("")
     year = "%Y" if len(first + third) > 4 else "%y"

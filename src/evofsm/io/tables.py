@@ -507,7 +507,7 @@ class CsvTable(Table):
     def _header(self, lines: Sequence[str], names: set[str]) -> int:
         """Which line names the columns: the one with most names, or the last before the rows."""
         headers = [Dialect(line, ()).columns for line in lines]
-        there = [len(names.intersection(fields)) for fields in headers]
+        there = [len(names & {*line}) * (not any(map(is_value, line))) for line in headers]
         if any(there):
             return there.index(max(there))
         rows = [at for at, line in enumerate(lines) if line.strip() and not _COMMENT.match(line)]
