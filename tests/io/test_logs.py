@@ -203,6 +203,7 @@ def test_episodes_that_come_back_are_refused_with_the_remedy(tmp_path, pieces):
         (gzip.compress(b"", mtime=0), "is empty"),
         (HEADER.encode(), "has a header but no rows"),
         (b"# drive 7\n0,1\n1,2\n", "line 2: '0,1' is no header"),
+        (b"# drive\n" * 200 + b"x,y\n# 1\n", "has no column 'gap'; it has x, y"),
         (b'# "x, m";y\n0;1\n1;2\n', "no column 'gap'; it has \"x, m\", y"),
         (b"x\x1b[2J,y\n0,1\n1,2\n", r"it has x\u001b[2J, y"),
         (b"\x89MCAP0\r\n\x01" + bytes(8) + b"\4\0\0\0ros2", "is a bag of ROS 2; --topics"),
@@ -326,6 +327,7 @@ def test_a_missing_action_is_counted_where_another_row_follows(tmp_path, pieces)
 
 
 ABOVE = {
+    "many comments": "# drive 7\n\n" * 150 + "{}",
     "comments": "# drive 7\n% of Monday\n//\n{}",
     "notes": "Drive 7\n\nrecorded,2026-03-14\ntime,of day\n{}",
     "blank": "\n\n{}",

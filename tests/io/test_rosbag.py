@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -125,6 +126,13 @@ def test_topics_that_nobody_asked_for_may_hold_anything(tmp_path, plugin):
     told = {"variables": {**TOLD["variables"], "gap": "/3/_service_event.x"}}
     with pytest.raises(ValueError, match="are packed as json, not as CDR"):
         read(path, told)
+    with (tmp_path / "bare.mcap").open("wb") as out:
+        bare = McapWriter(out)
+        bare.start("ros2")
+        bare.add_message(bare.register_channel("/gap", "cdr", 0), 0, bytes(12), 0)
+        bare.finish()
+    with pytest.raises(ValueError, match="messages of '/gap' have no schema"):
+        read(str(tmp_path / "bare.mcap"), {"variables": {**TOLD["variables"], "gap": "/gap.data"}})
 
 
 def test_what_is_too_old_is_a_hole_in_time(tmp_path):

@@ -85,6 +85,9 @@ def test_variables_may_be_chosen_and_ordered_and_nothing_else(tmp_path):
     for asked in ({"action": "accel"}, {"dt": 0.1}, {"episode": ["run"]}, {"failed": "crash"}):
         assert f"cannot be read with --{next(iter(asked))}" in refusal(path, **asked)
     assert "cannot be read with --unit: write it in s, m" in refusal(path, units={"v": "km/h"})
+    noted, of_ms = Noted(), write(tmp_path / "b.xml", xml({0: PAIR, 100: PAIR}))
+    assert len(list(read_traces([of_ms], noted=noted))) == 1
+    assert "time=ms converts it; a table of objects has to be in s" in warnings_of(noted)[0]
 
 
 def test_so_many_waiting_rows_are_handed_on_before_the_pairs_part(tmp_path, monkeypatch):

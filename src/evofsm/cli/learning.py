@@ -116,11 +116,12 @@ def unit_in(name: str, *, is_time: bool) -> str:
 def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
     """What is most likely a mistake, and what would mend it."""
     columns = columns or LogColumns()
-    time = columns.time
+    time, cars = columns.time, columns.observe.names == VARIABLES
+    of_objects = "; a table of objects has to be in s, m and m/s" * cars
     units = {name: unit for name in noted.untold if (unit := unit_in(name, is_time=name == time))}
     warnings = [
         f"{name} reaches {fastest:,.0f} m/s, faster than any car on a road: is it in km/h or "
-        f"mph? --unit {quote(f'{name}=km/h')} converts it"
+        f"mph? --unit {quote(f'{name}=km/h')} converts it{of_objects}"
         for name, fastest in noted.fastest.items()
         if name not in units and fastest < _NO_SPEED
     ]
@@ -141,11 +142,11 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
         text = ": ".join([f"no row meets --failed {quote(columns.failed)}", *goes])
         warnings.append(text.rstrip())
     is_untold = time in noted.untold and time not in units and not noted.resampled
-    cars, step = columns.observe.names == VARIABLES, noted.longest_step
+    step = noted.longest_step
     ratio = max(step / 60.0, 60.0 / max(step, 1e-9))  # machines have parts of minutes, or several
     if step > 0.0 and is_untold and (cars or abs(ratio - round(ratio)) > 0.05):
         unit = min(_SHORTER, key=lambda unit: abs(np.log10(step * TIMES[unit]) + 1.0))
-        cause = f"is the time in {unit}? --unit {time}={unit} converts it"
+        cause = f"is the time in {unit}? --unit {time}={unit} converts it{of_objects}"
         warnings.append(f"there is a row every {step:,.6g} s: {cause}")
     nobody = " (no leader)" * cars
 

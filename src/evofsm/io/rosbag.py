@@ -345,6 +345,8 @@ class _Type(NamedTuple):
 
         if self.packed != "cdr":
             raise RefusedError(f"messages of {topic!r} are packed as {self.packed}, not as CDR")
+        if not self.name:
+            raise RefusedError(f"messages of {topic!r} have no schema to say what they hold")
         if not self.definition:
             return get_typestore(Stores.LATEST)
         store = get_typestore(Stores.EMPTY)

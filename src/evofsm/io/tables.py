@@ -78,6 +78,7 @@ SI = {unit: base for base, group in _GROUPS.items() for unit in group}
 _SPELT = {"kmh": "km/h", "kph": "km/h", "kmph": "km/h", "km/hr": "km/h", "mps": "m/s", "sec": "s"}
 _SPELT |= {"day": "d", "days": "d"}
 _SPELT |= {"\u00b5s": "us", "\u03bcs": "us", "knots": "kn", "kt": "kn", "m/s/s": "m/s2"}
+_COMMENTS = re.compile(r"([ \t]*(#|%|//).*\n|[^\S\n]*\n)*")  # lines of them, and empty ones
 _COMMENT = re.compile(r"\A\s*(#|%|//)+\s*")  # what stands before the last line of a comment
 MISSING = ("", "na", "n/a", "nan", "null", "none")  #: what stands in a field where nothing does
 # By which a comma is known to be a decimal one; groups of three digits it may separate as well.
@@ -161,7 +162,8 @@ class Skips:
 
     def refuse_nothing(self, otherwise: str) -> NoReturn:
         """Raise where no row is left, for what was left out first."""
-        raise ValueError(next(iter(self.first.values()), otherwise))
+        faults = (first for kind, first in self.first.items() if kind != "comment")
+        raise ValueError(next(faults, otherwise))
 
 
 class Source(AbstractContextManager["Source"]):
@@ -489,7 +491,7 @@ class CsvTable(Table):
         csv.field_size_limit(max(csv.field_size_limit(), _CSV_BYTES + 2 * _LONGEST_LINE))
         with Source(path, Skips(1)) as source:  # said where the rows are read
             text = decoded(source.rows(), path).removeprefix("\ufeff")
-        most = Dialect.most_above
+        most = Dialect.most_above + next(_COMMENTS.finditer(text))[0].count("\n")
         lines = [line.rstrip("\r") for line in text.split("\n", most)[:most]]
         at = self._header(lines, set(names))
         self._dialect = dialect = Dialect(lines[at], lines[at + 1 : at + 1 + Dialect.most_below])
