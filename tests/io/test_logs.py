@@ -529,6 +529,18 @@ def test_rows_without_a_leader_end_an_episode(tmp_path, pieces, nothing):
     assert "1 failure lies in rows that are left out" in " ".join(warnings_of(noted))
 
 
+@pytest.mark.parametrize("sign", ["\t", "|"])
+@pytest.mark.parametrize("first", ["10,125", "20"])
+def test_decimal_commas_are_known_at_other_signs_by_one_that_parts_no_thousands(
+    tmp_path, sign, first
+):
+    gaps = [first] * 6 + ["12,375"]
+    rows = [(k, gap, 10, "0,125" if k == 6 else 9, 1) for k, gap in enumerate(gaps)]
+    lines = [sign.join(map(str, row)) for row in rows]
+    path = write(tmp_path / "a.csv", lines, sign.join(SHORT.split(",")[1:6]))
+    assert together(path)[0] == [float(gap.replace(",", ".")) for gap in gaps]
+
+
 @pytest.mark.parametrize("odd", ["", ";;;;"])
 def test_where_fields_end_at_a_semicolon_numbers_may_have_a_decimal_comma(tmp_path, odd):
     lines = [f"{k / 10}; {20 - k / 3}; 10,5; 11; -0,5".replace(".", ",") for k in range(4)]
@@ -691,8 +703,10 @@ def test_times_may_be_dates(tmp_path, texts, point):
         assert chunk.times == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4], abs=1e-12)
         assert (chunk.dt, np.flatnonzero(chunk.begins).tolist()) == (0.1, [0])
     if texts is not ZONED:
-        (chunk,) = read(path, units={"time": f"%Y-%m-%d %H:%M:%S{point}%f"})
-        assert chunk.times[-1] == pytest.approx(0.4)
+        for day, form in (("", "%Y-%m-%d "), ("2026-03-14 ", "")):  # of a time of day alone, too
+            path = write(tmp_path / "b.csv", [line.replace(day, "") for line in lines], SHORT)
+            (chunk,) = read(path, units={"time": f"{form}%H:%M:%S{point}%f"})
+            assert chunk.times[-1] == pytest.approx(0.4)
 
 
 @pytest.mark.parametrize(

@@ -81,8 +81,8 @@ _SPELT |= {"\u00b5s": "us", "\u03bcs": "us", "knots": "kn", "kt": "kn", "m/s/s":
 _COMMENTS = re.compile(r"([ \t]*(#|%|//).*\n|[^\S\n]*\n)*")  # lines of them, and empty ones
 _COMMENT = re.compile(r"\A\s*(#|%|//)+\s*")  # what stands before the last line of a comment
 MISSING = ("", "na", "n/a", "nan", "null", "none")  #: what stands in a field where nothing does
-# By which a comma is known to be a decimal one; groups of three digits it may separate as well.
-_DECIMAL_COMMA = re.compile(r"\s*-?\d+,(\d\d?|\d{4,})\s*")
+# By which a comma is known to be a decimal one; thousands it may separate as well, but of no zero.
+_DECIMAL_COMMA = re.compile(r"\s*-?(0,\d+|\d+,(\d\d?|\d{4,}))\s*")
 _CONTROL = re.compile(rb"[\0-\x08\x0e-\x1f]")  # what no text holds
 _DATE = re.compile(r"\s*\d{4}-?\d\d-?\d\d[Tt ]")
 # The day first, as only dots tell; whether its year has a century, and whether seconds follow.
@@ -456,7 +456,7 @@ class Dialect:
         self.columns = _fields(header, self.separator)
         self.units: Mapping[str, str] = {}  #: as a row below the names says
         rows = [_fields(row, self.separator) for row in below]
-        values = next((row for row in rows if any(map(is_value, row))), [])
+        values = next((row for row in rows[: self.most_below] if any(map(is_value, row))), [])
         above = rows[: rows.index(values)] if values else rows[:1]
         units = [unit_of(text) for row in above[:1] for text in row]
         pairs = zip(units, values, strict=False)
@@ -494,7 +494,7 @@ class CsvTable(Table):
         most = Dialect.most_above + next(_COMMENTS.finditer(text))[0].count("\n")
         lines = [line.rstrip("\r") for line in text.split("\n", most)[:most]]
         at = self._header(lines, set(names))
-        self._dialect = dialect = Dialect(lines[at], lines[at + 1 : at + 1 + Dialect.most_below])
+        self._dialect = dialect = Dialect(lines[at], lines[at + 1 :])
         self.columns, self.units, header = dialect.columns, dialect.units, lines[at]
         self.separator = dialect.separator
         self._above = at + 1 + dialect.n_told  # lines before the first row
@@ -826,6 +826,8 @@ def _microseconds(
         if not form and (match := _DAY_FIRST.match(str(texts.first()))):
             form = f"%d.%m.%{'Y' if match[1] else 'y'} %H:%M{':%S' if match[2] else ''}"
             parts = "%.f" if match[2] else ""
+        if form and not re.search("%[YyFDcs]", form):  # a time of day
+            texts, form = "1970-01-01 " + texts, f"%Y-%m-%d {form}"
         form = form.replace(",%f", ".%f").replace(".%f", "%.f").replace("%f", "%6f")  # as polars
         if "," not in form and texts.str.contains(",", literal=True).any():
             texts = texts.str.replace(r",\s+", " ").str.replace(",", ".", literal=True)
