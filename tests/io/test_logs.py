@@ -210,6 +210,16 @@ def test_episodes_that_come_back_are_refused_with_the_remedy(tmp_path, pieces):
         (b"\x00\x01\x02\xff\xfe" * 50, "not text in UTF-8"),
         (b"\xfd7zXZ\0" + bytes(50), "compressed by xz; unpack it"),
         (b"PK\3\4" + bytes(50), "an Excel workbook"),
+        (b'[\n  {"time": 0}]', "is JSON"),
+        (
+            HEADER.encode("utf-16-le"),
+            "not text in UTF-8 (an archive, binary data, or text in UTF-16",
+        ),
+        (b"version https://git-lfs.github.com/spec/v1\n", "is a pointer of Git LFS"),
+        (
+            gzip.compress(b"PAR1" + bytes(50), mtime=0),
+            "is gzipped, and cannot be read so; unpack it",
+        ),
         (f"{HEADER}\nr,a,0,0,1,1,1,1\nr,\0é".encode("latin1"), "after line 2: this is not text"),
         (f"{HEADER.replace('segment', 'gap')}\n1,2".encode(), "two columns are called 'gap'"),
         (f'{HEADER}\nr,"v1,0,1\n{"x" * 90}'.encode(), "unclosed quote"),

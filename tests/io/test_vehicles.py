@@ -497,7 +497,8 @@ def test_osi_that_cannot_be_right_is_refused_in_words(tmp_path):
         (next(osi_traces(x=math.nan)), "it needs a length and numbers"),
         (beside, "no vehicle ever follows another one"),
         (next(osi_traces(lane=0, length=0.0, x=math.nan)), "no vehicle ever follows"),
-        (b"", "no object is on a lane"),
+        (b"", "no vehicle is in it (empty"),
+        (b"\0\0\0\0", "such as SensorData"),
     ):
         path.write_bytes(content)
         assert said in refusal(path)

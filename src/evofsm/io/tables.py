@@ -59,6 +59,9 @@ _FOREIGN = {
     b"\xfe\xff": "is text in UTF-16; write it in UTF-8: iconv -f UTF-16 -t UTF-8 FILE > drive.csv",
     b"\x93NUMPY": "is an array of NumPy; write it as CSV with the names of its columns: "
     "numpy.savetxt('drive.csv', numpy.load('FILE'), delimiter=',', header='time,gap,...')",
+    b"version https://git-lfs": "is a pointer of Git LFS; fetch the file itself: git lfs pull",
+    b"UnFinMF ": "is a measurement in ASAM MDF that was not finalized; write it as CSV: asammdf",
+    b"[{": "is JSON; write its rows as CSV: polars.read_json('FILE').write_csv('drive.csv')",
     b"{": "is JSON; write its rows as CSV: polars.read_ndjson('FILE').write_csv('drive.csv')",
 }
 _PROFILE = len(_MCAP) + 1 + 8 + 4  # of MCAP, behind the mark, an opcode and two lengths
@@ -124,16 +127,25 @@ def file_kind(path: str) -> Kind:
         return "osi"
     with Source(path) as source:
         head = source.read(64).removeprefix(_BYTE_ORDER_MARK).lstrip()
+        head, is_packed = re.sub(rb"\A\[\s+", b"[", head), source.is_packed
     if not head:
         raise ValueError(f"{path} is empty")
     if b'{"__metadata__"' in head:
         raise ValueError(f"{path} holds what was learnt, and is no log: evofsm inspect prints it")
     if foreign := next((says for mark, says in _FOREIGN.items() if head.startswith(mark)), ""):
         raise ValueError(f"{path} {foreign.replace('FILE', path)}")
+    if is_packed and head.startswith((_PARQUET, _SQLITE, _MCAP)):
+        raise ValueError(f"{path} is gzipped, and cannot be read so; unpack it: gzip -dk {path}")
     if head.startswith(_MCAP):
         return "bag" if head[_PROFILE:].startswith(b"ros2") else "mcap"
     marks: dict[bytes, Kind] = {_PARQUET: "parquet", _SQLITE: "bag", b"<": "xml"}
-    return next((kind for mark, kind in marks.items() if head.startswith(mark)), "csv")
+    for mark, kind in marks.items():
+        if head.startswith(mark):
+            return kind
+    if b"\0" in head:
+        cause = "an archive, binary data, or text in UTF-16?"
+        raise ValueError(f"{path} is not text in UTF-8 ({cause})")
+    return "csv"
 
 
 @dataclass
@@ -179,8 +191,8 @@ class Source(AbstractContextManager["Source"]):
         self.is_cut = False  #: whether the last line, once it is read, has no end
         self._skips, self._ended = skips, False
         self._raw = io.BufferedReader(io.FileIO(path))
-        self._packed = self._raw.peek(2).startswith(_GZIP)
-        self._file = gzip.GzipFile(fileobj=self._raw) if self._packed else self._raw
+        self.is_packed = self._raw.peek(2).startswith(_GZIP)
+        self._file = gzip.GzipFile(fileobj=self._raw) if self.is_packed else self._raw
 
     def __exit__(self, *error: object) -> None:
         self._file.close()
@@ -208,7 +220,7 @@ class Source(AbstractContextManager["Source"]):
             block += line
             quotes += line.count(b'"')
             if len(block) > most and not line.endswith(b"\n"):
-                where = f"line {self.lines}" if self._packed else f"byte {self._raw.tell():,}"
+                where = f"line {self.lines}" if self.is_packed else f"byte {self._raw.tell():,}"
                 fault = f"a line of more than {_LONGEST_LINE:,} bytes; this is no table"
                 raise ValueError(f"{self.path}, about {where}: {fault}")
         return bytes(block)
@@ -227,7 +239,7 @@ class Source(AbstractContextManager["Source"]):
                 raise ValueError(message) from error
             self._skips.leave_out("cut", message)
             self._ended, data = True, b""
-        if self._packed:
+        if self.is_packed:
             self.lines += data.count(b"\n")
         if self._skips is not None:
             self._skips.on_read(self._raw.tell() - before)

@@ -42,6 +42,7 @@ _NO_CAR = (
     " holds no vehicle on a lane (an empty simulation, persons only, or --fcd-output.attributes "
     "without lane?)"
 )
+_NO_VEHICLE = ": no vehicle is in it (empty, or messages of another kind, such as SensorData?)"
 _NO_OBJECT = (
     ": no object is on a lane, and who follows whom is told by lanes (recorded without a map? "
     "assign the lanes first)"
@@ -108,14 +109,14 @@ class PairTable(Table):
         """Rows of a pair for as long as it stays one, or until too many wait."""
         open_pairs: dict[_Pair, array[float]] = {}
         vehicle_of = _object if self.lengths is None else partial(_car, self.lengths)
-        before, tracks, has_lanes = -math.inf, dict[str, _Track](), False
+        before, tracks, has_lanes, has_any = -math.inf, dict[str, _Track](), False, False
         for time, where, entries in self.moments:
             try:  # persons, and vehicles off the road, have no lane
                 cars = [vehicle_of(*entry) for entry in entries if _is_on_lane(entry[1])]
             except ValueError as error:  # without one of them, others would be taken for pairs
                 self.skips.leave_out("timestep", str(error))
                 continue
-            has_lanes = has_lanes or bool(cars)
+            has_lanes, has_any = has_lanes or bool(cars), has_any or bool(entries)
             lanes = self._lanes(time, cars, tracks)
             if not time > before:
                 cause = "rows not sorted by time, or two recordings in one file?"
@@ -139,7 +140,8 @@ class PairTable(Table):
                 open_pairs = {}
         yield from open_pairs.items()
         if not has_lanes:
-            self.skips.refuse_nothing(self.path + (_NO_OBJECT if self.lengths is None else _NO_CAR))
+            fault = _NO_OBJECT if has_any else _NO_VEHICLE
+            self.skips.refuse_nothing(self.path + (fault if self.lengths is None else _NO_CAR))
 
     def _lanes(
         self, time: float, cars: Iterable[Vehicle], tracks: dict[str, _Track]
