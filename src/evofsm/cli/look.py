@@ -202,9 +202,8 @@ def _first_rows(
     together = (f"{a},{b}" for a, b in apart if is_date(f"{firsts[a]} {firsts[b]}"))
     early = next(table.pieces(Wanted([], date_columns))).texts if date_columns else {}
     table.skips.kinds.clear()  # said where all rows are read
-    # A date that stays is that of the export.
-    changing = (name for name, dates in early.items() if dates.n_unique() > 1)
-    clock, form = next(changing, "") or next(together, ""), ""
+    clocks = (name for name, dates in early.items() if dates.n_unique() > 1)  # no date of an export
+    clock, form = next(clocks, "") or next(together, ""), ""
     dates = clock.split(",") if clock else []
     numbers = [name for name in firsts if table.holds(name) == "number"]
     texts = [name for name in firsts if name not in {*numbers, *date_columns, *dates}]
@@ -266,8 +265,8 @@ def _clock_of(frame: polars.DataFrame, names: Sequence[str]) -> tuple[str, str, 
     for name in (*filter(_TIME.match, epochs), *epochs):
         since = {"d": "1899-12-30, as Excel has it"}.get(epochs[name], "1970")
         return name, epochs[name], f", {epochs[name]} since {since}"
-    named = [name for name in names if any(map(_CLOCK.fullmatch, _WORDS.findall(name)))]
-    signs = ((name, np.sign(np.diff(frame[name].drop_nans().to_numpy()))) for name in named)
+    likely = (name for name in names if any(map(_CLOCK.fullmatch, _WORDS.findall(name))))
+    signs = ((name, np.sign(np.diff(frame[name].drop_nans().to_numpy()))) for name in likely)
     runs = [name for name, sign in signs if sign.sum() > 0.8 * abs(sign).sum() > 0.0]
     clocks = *filter(_TIME.match, names), *runs, *filter(_FRAME.match, names)
     clock = next((name for name in clocks if frame[name].drop_nans().n_unique() > 1), "")
