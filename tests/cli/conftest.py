@@ -1,11 +1,11 @@
 """What tests of commands share."""
 
-import asyncio
 import math
-import queue
 import random
+import sys
 import threading
-from contextlib import contextmanager
+import time
+from contextlib import contextmanager, suppress
 from datetime import datetime, timedelta
 
 import polars
@@ -65,35 +65,26 @@ def pump():
 
 @pytest.fixture
 def shown():
-    """Serve a page in a thread, and play on it, as it is set."""
+    """Serve a page, and play on it in a thread, as it is set."""
+
+    def played(player):
+        with suppress(SystemExit):
+            player.play()
 
     @contextmanager
     def show(opened, **settings):
-        served = queue.Queue()
-
-        async def serve():
+        with opened() as watched, LivePage() as page:
+            page.player = player = Player(watched, page)
+            player.__dict__ |= {f"_{name}": v for name, v in ({"awaits": False} | settings).items()}
+            playing = threading.Thread(target=played, args=[player])
+            playing.start()
             try:
-                with opened() as watched:
-                    async with LivePage() as page:
-                        page.player = Player(watched, page)
-                        page.player.set(**{"awaits": False, **settings})
-                        stop = asyncio.Event()
-                        playing = asyncio.create_task(page.player.play())
-                        served.put((page, asyncio.get_running_loop(), stop))
-                        await stop.wait()
-                        playing.cancel()
-            except Exception as error:
-                served.put(error)
-
-        thread = threading.Thread(target=lambda: asyncio.run(serve()))
-        thread.start()
-        if isinstance(found := served.get(timeout=60), Exception):
-            raise found
-        page, loop, stop = found
-        try:
-            yield page
-        finally:
-            loop.call_soon_threadsafe(stop.set)
-            thread.join()
+                while "known" not in page._latest:
+                    time.sleep(0.01)
+                yield page
+            finally:
+                player._watched.restart = sys.exit
+                player.restart()
+                playing.join()
 
     return show

@@ -1,8 +1,10 @@
 import signal
+from contextlib import suppress
 from urllib.request import urlopen
 
 import pytest
 from tests.cli.test_cli_monitor import started
+from websockets.sync.client import connect
 
 from evofsm import EvolvingFSM
 
@@ -31,6 +33,34 @@ def test_it_prints_an_address_that_answers_and_ends_with_control_c(tmp_path, arg
     assert may in said
     assert rest == "\nThe page is closed.\n"
     assert [line for line in errors.splitlines() if "assumed:" not in line] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("fault", "status", "said"),
+    [
+        ("time.sleep(600)", 0, ""),
+        ("1 / 0", 2, "the run broke off: ZeroDivisionError: division by zero"),
+    ],
+)
+def test_control_c_ends_what_hangs_or_broke_off(tmp_path, fault, status, said):
+    (tmp_path / "own.py").write_text(
+        "import gymnasium, os, time\nenvironment = lambda: gymnasium.make('Pendulum-v1')\n"
+        f"controller = lambda seen, random: [0.0 if not os.path.exists('armed') else {fault}]\n"
+    )
+    words = "watch", "own.py", "--learn-first", "0", "--no-browser"
+    with started(*words, cwd=tmp_path, text=True) as process:
+        process.stdout.readline()
+        address = process.stdout.readline().strip()
+        (tmp_path / "armed").touch()
+        place = f"{address.replace('http', 'ws')}socket"
+        with connect(place, origin=address.rsplit("/", 2)[0], proxy=None) as client:
+            with suppress(TimeoutError):
+                while client.recv(timeout=1):
+                    pass
+            process.send_signal(signal.SIGINT)
+            _, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors.strip()) == (status, said and f"evofsm: {said}")
 
 
 @pytest.mark.parametrize(

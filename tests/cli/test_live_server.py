@@ -3,6 +3,7 @@
 import json
 import math
 import socket
+import threading
 import time
 from contextlib import closing, suppress
 from http.client import HTTPConnection
@@ -47,6 +48,7 @@ def looking_on(page, *, origin=None, token=None, sock=None, host=None):
         sock=sock or socket.create_connection(("127.0.0.1", page.port)),
         proxy=None,
         open_timeout=60,
+        close_timeout=1,
     )
 
 
@@ -166,6 +168,19 @@ def test_pages_act_on_the_run(page):
         assert told(client, "start")["case"] == 3
 
 
+def test_a_page_is_served_while_what_is_watched_hangs(page, monkeypatch):
+    goes, step = threading.Event(), page.player._watched.step
+    monkeypatch.setattr(page.player._watched, "step", lambda: goes.wait(60) and step())
+    with looking_on(page) as first:
+        first.send('{"do": "step"}')
+        assert get(page, f"/{page.token}/")[0] == 200
+        with looking_on(page) as later:
+            assert told(later, "start")["case"] == 0
+        assert not page._frames
+        goes.set()
+        assert told(first, "frame")["number"] == 0
+
+
 def test_a_run_waits_for_the_first_who_looks_on(shown):
     with shown(session, speed=math.inf, awaits=True) as page:
         assert get(page, f"/{page.token}/")[0] == 200  # who loads the page only sees nothing yet
@@ -247,12 +262,13 @@ def test_who_does_not_read_does_not_hold_the_run_up_and_is_later_shown_all_of_it
     monkeypatch.setattr("evofsm.cli.watch.server._MOST_UNREAD", 1 << 14)
     narrow = socket.socket()
     narrow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    with shown(session, awaits=True, speed=math.inf) as page:
+    with shown(session, paused=True) as page:
         narrow.connect(("127.0.0.1", page.port))
         with looking_on(page, sock=narrow), looking_on(page) as client:
-            while len(page._clients) == 2:  # the buffers on the way hold some runs
-                while not told(client, "frame")["over"]:
-                    pass
-                client.send('{"do": "restart"}')
+            while len(page._clients) == 2:  # the buffers on the way hold some megabytes
+                page("long", "x" * 400_000)
+                told(client, "long")
+                client.send('{"do": "step"}')
+                assert not told(client, "frame")["over"]
         with looking_on(page) as again:
             assert json.loads(again.recv(timeout=60))["parts"][0]["kind"] == "start"

@@ -1,7 +1,8 @@
 """A run that is watched: what is shown of it, its story, and the clock it is played by."""
 
-import asyncio
 import math
+import sys
+import time
 from functools import cache
 
 import pytest
@@ -231,25 +232,41 @@ def test_episodes_of_a_log_end_with_a_contact_and_it_opens_on_one(tmp_path):
 def test_what_was_before_is_shown_at_once():
     session, told = opened(), []
     session.start = session.start._replace(begins=2.0)
+    end = time.monotonic() + 1.0
 
-    async def play():
-        player = Player(session, lambda kind, what: told.append(kind))
-        player.set(awaits=False, speed=0.25)
-        playing = asyncio.create_task(player.play())
-        await asyncio.sleep(1.0)
-        playing.cancel()
+    def hear(kind, what):
+        told.append(kind)
+        if time.monotonic() > end:
+            sys.exit()
 
-    asyncio.run(play())
+    player = Player(session, hear)
+    player.set(awaits=False, speed=0.25)
+    with pytest.raises(SystemExit):
+        player.play()
     assert 8 <= told.count("frame") <= 12  # one every 0.25 s of the run, then one a second
 
 
-def test_a_run_that_breaks_off_says_why():
+def test_a_run_that_breaks_off_says_why_and_can_be_begun_anew(capsys):
     session, told = opened(), []
-    session.step = lambda: 1 / 0
-    player = Player(session, lambda *what: told.append(what))
+
+    def hear(kind, what):
+        told.append((kind, what))
+        if kind == "failed":
+            sys.exit()
+
+    player = Player(session, hear)
     player.set(awaits=False, speed=math.inf)
-    asyncio.run(asyncio.wait_for(player.play(), 60.0))
-    assert told[-1] == ("failed", "ZeroDivisionError: division by zero")
+    session.step, step = lambda: 1 / 0, session.step
+    with pytest.raises(SystemExit):
+        player.play()
+    why = "ZeroDivisionError: division by zero"
+    assert (told[-1], told[-2][1].over, player.fault) == (("failed", why), True, why)
+    assert capsys.readouterr().err == f"evofsm: the run broke off: {why}\n"
+    session.step = lambda: sys.exit(step().number)
+    player.restart()
+    with pytest.raises(SystemExit, match="0"):
+        player.play()
+    assert player.fault == ""
 
 
 # -- A judge that was told nothing but which episodes failed --------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import re
 import webbrowser
 from contextlib import suppress
@@ -39,7 +38,7 @@ def watch(
     *,
     reading: dict[str, Any],
     no_browser: Annotated[bool, option("Print the address alone.", "--no-browser")] = False,
-) -> None:
+) -> int:
     """Watch a run in the browser while it is driven, and act on it; or a log.
 
     A Python file defines a family of scenarios, called family, or a function environment(), which
@@ -55,43 +54,39 @@ def watch(
     from evofsm.cli.watch import session
     from evofsm.cli.watch.server import LivePage, Player
 
-    async def serve(run: session.Session) -> None:
-        async with LivePage() as page:
-            page.player = Player(run, page)
-            may = "steer the run" if run.start.live else "look on"
-            say(f"Watch it here (Ctrl-C ends it); whoever has this address may {may}:")
-            print(f"  {page.address}", flush=True)
-            if not no_browser:
-                webbrowser.open(page.address)
-            await page.player.play()
-            await asyncio.Event().wait()  # it broke off; the page says why
-
     is_log = _is_log(what)
     names = ("world", "judge", "seed", "learn_first") if is_log else ("guard", "brakes", *reading)
     options.refuse_typed(ctx, names, "what is driven" if is_log else f"a log, and {what} is none")
-    with suppress(KeyboardInterrupt):
-        if is_log:
-            risk = None if tolerance == options.TOLERANCE else tolerance
-            log_options, units = options.read_with(guard)
-            reader = {**log_options, **reading}
-            log_guard = None if guard is None else load_learning(guard, reader.get("failed"))
-            try:
-                log_format = replace(options.reading_of(**reader), usual_units=units)
-                is_simulation = what.endswith(options.SUMO)
-                show = session.watched_simulation if is_simulation else session.watched_log
-                run = show(what, log_format, risk, case, log_guard, brakes=brakes)
-            except ValueError as error:
-                if reading or "has no column" not in str(error):
-                    raise
-                look = f"evofsm learn {quote(what)} says what it holds, and what to name"
-                raise ValueError(f"{error}. Is it no log of cars? {look}") from error
-        else:
-            run = session.watched_run(
-                what, case or 1, world, judge, tolerance=tolerance, seed=seed, learnt=learn_first
-            )
-        with run:
-            asyncio.run(serve(run))
+    if is_log:
+        risk = None if tolerance == options.TOLERANCE else tolerance
+        log_options, units = options.read_with(guard)
+        reader = {**log_options, **reading}
+        log_guard = None if guard is None else load_learning(guard, reader.get("failed"))
+        try:
+            log_format = replace(options.reading_of(**reader), usual_units=units)
+            is_simulation = what.endswith(options.SUMO)
+            show = session.watched_simulation if is_simulation else session.watched_log
+            run = show(what, log_format, risk, case, log_guard, brakes=brakes)
+        except ValueError as error:
+            if reading or "has no column" not in str(error):
+                raise
+            look = f"evofsm learn {quote(what)} says what it holds, and what to name"
+            raise ValueError(f"{error}. Is it no log of cars? {look}") from error
+    else:
+        run = session.watched_run(
+            what, case or 1, world, judge, tolerance=tolerance, seed=seed, learnt=learn_first
+        )
+    with run, LivePage() as page:
+        page.player = player = Player(run, page)
+        may = "steer the run" if run.start.live else "look on"
+        say(f"Watch it here (Ctrl-C ends it); whoever has this address may {may}:")
+        print(f"  {page.address}", flush=True)
+        if not no_browser:
+            webbrowser.open(page.address)
+        with suppress(KeyboardInterrupt):
+            player.play()
     say("\nThe page is closed.")
+    return 2 if player.fault else 0
 
 
 def _is_log(what: str) -> bool:

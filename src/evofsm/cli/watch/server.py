@@ -15,14 +15,14 @@ import secrets
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
 from http import HTTPStatus
 from importlib.resources import files
+from threading import Event, Thread
 from typing import Any, NamedTuple, Self
 
 import msgspec
 
-from evofsm.cli.show import plain
+from evofsm.cli.show import plain, warn
 from evofsm.cli.watch.session import Session
 from evofsm.cli.watch.shown import Frame, Start
 from evofsm.cli.watch.words import introduce, tell
@@ -51,6 +51,7 @@ _NOT_TEXT, _NOT_UNDERSTOOD = 1003, 1008  # close codes (RFC 6455)
 _GRAPH_EVERY = 8  # between two graphs, unless a state was created [decisions]
 _FOLLOWED = 12.5  # decisions in a second that can be followed
 _LATE = 0.1  # who is late by more does not hurry to make up for it [s]
+_LISTENS = 0.5  # between two looks whether it is interrupted, which not every system wakes for [s]
 
 _log = logging.getLogger(__name__)
 _log.addHandler(logging.NullHandler())  # junk on the socket is nobody's traceback
@@ -69,8 +70,10 @@ class Player:
     """Plays what is watched at a pace, once someone attends, and does as it is told.
 
     ``audience`` is told "start", "frame", "graph", "known" and "clock", with what is called so, and
-    "failed" with why it broke off.
+    "failed" with why it broke off. `play` may run in one thread, and be told in another.
     """
+
+    fault = ""  #: why the latest run broke off; empty where it did not
 
     def __init__(self, watched: Session, audience: Callable[[str, Any], object]) -> None:
         # Real time, but no more decisions in a second than can be followed.
@@ -80,10 +83,11 @@ class Player:
         self._watched, self._audience, self._awaits = watched, audience, True
         self._paused = self._over = False
         self._steps = False  # once, although it is paused
+        self._revising = watched.revising
         self._due = 0.0  # when the next frame is [s]
         self._since = self._states = 0  # frames since the latest graph, and its states
-        self._order: Callable[[], object] | None = None  # of what may take time, the latest
-        self._news = asyncio.Event()
+        self._orders: deque[int | None] = deque(maxlen=1)  # the latest case to begin
+        self._news = Event()
 
     def attend(self) -> None:
         """Someone looks on: play, if that was waited for."""
@@ -91,53 +95,49 @@ class Player:
             self.set(awaits=False)
 
     def set(self, **changes: bool | float) -> None:
-        """Play on otherwise: ``paused``, or at a ``speed``; with ``steps`` once, though paused."""
+        """Play on otherwise: ``paused``, ``revising``, at a ``speed``; or ``steps`` once."""
         for name, value in changes.items():
             setattr(self, f"_{name}", value)
-        self._due = time.monotonic()
-        self._audience("clock", self._clock())
         self._news.set()
-
-    def revise(self, on: bool) -> None:
-        """Switch the reviser on or off."""
-        self._watched.revising = on
-        self.set()
 
     def restart(self, case: int | None = None) -> None:
         """Begin anew, or another case; and go on if it waited."""
-        self._order = lambda: self._watched.restart(case)
+        self._orders.append(case)
         self._news.set()
 
-    async def play(self) -> None:
-        """Play until it is cancelled, or breaks off."""
-        try:
-            self._begin()
-            while True:
-                await self._wait()
-                if self._order is not None:
-                    order, self._order = self._order, None
-                    order()
-                    self._paused = False
-                    self._begin()
-                elif self._patience() <= 0.0:
-                    self._steps = False
-                    interval = self._watched.start.interval / self._speed
-                    # What came late is not made up for.
-                    self._due = max(self._due, time.monotonic() - _LATE) + interval
-                    frame = self._watched.step()
-                    if frame.time < self._watched.start.begins:
-                        self._due = time.monotonic()
-                    self._show(frame)
-        except Exception as error:
-            # Whoever looks on must learn why nothing moves any more.
-            self._audience("failed", f"{type(error).__name__}: {error}")
+    def play(self) -> None:
+        """Play until it is interrupted; a run that breaks off can be begun anew."""
+        self._begin()
+        while True:
+            if self._news.wait(min(self._patience(), _LISTENS)):
+                self._news.clear()
+                self._due = time.monotonic()
+                self._audience("clock", self._clock())
+            try:
+                self._go_on()
+            except Exception as error:
+                # Whoever looks on must learn why nothing moves any more.
+                self.fault, self._over = f"{type(error).__name__}: {error}", True
+                warn(f"the run broke off: {self.fault}")
+                self._audience("clock", self._clock())
+                self._audience("failed", self.fault)
 
-    async def _wait(self) -> None:
-        """Until the next frame, or until something was told; others have their turn."""
-        wait = max(0.0, self._patience())
-        with suppress(TimeoutError):
-            await asyncio.wait_for(self._news.wait(), None if math.isinf(wait) else wait)
-        self._news.clear()
+    def _go_on(self) -> None:
+        """Do what is due."""
+        if self._orders:
+            self._watched.restart(self._orders.pop())
+            self._paused = False
+            self._begin()
+        elif self._patience() <= 0.0:
+            self._steps = False
+            interval = self._watched.start.interval / self._speed
+            # What came late is not made up for.
+            self._due = max(self._due, time.monotonic() - _LATE) + interval
+            self._watched.revising = self._revising
+            frame = self._watched.step()
+            if frame.time < self._watched.start.begins:
+                self._due = time.monotonic()
+            self._show(frame)
 
     def _patience(self) -> float:
         """Time until the next frame [s]; infinite where none comes by itself."""
@@ -146,7 +146,7 @@ class Player:
         return 0.0 if self._paused else self._due - time.monotonic()
 
     def _begin(self) -> None:
-        self._over, self._due = False, time.monotonic()
+        self._over, self.fault, self._due = False, "", time.monotonic()
         self._audience("start", self._watched.start)
         self._audience("clock", self._clock())
         self._draw()
@@ -169,7 +169,7 @@ class Player:
             self._audience("clock", self._clock())
 
     def _clock(self) -> Clock:
-        return Clock(self._paused, self._speed, self._watched.revising, self._over)
+        return Clock(self._paused, self._speed, self._revising, self._over)
 
 
 def message(kind: str, what: Any, start: Start | None = None) -> str:
@@ -194,7 +194,10 @@ def message(kind: str, what: Any, start: Start | None = None) -> str:
 
 
 class LivePage:
-    """Serves a run to browsers on this computer, in ``async with``; the audience of a `Player`."""
+    """Serves a run to browsers on this computer, in ``with``; the audience of a `Player`.
+
+    It has a thread of its own, and answers also where what is watched takes long.
+    """
 
     def __init__(self) -> None:
         self.token = secrets.token_urlsafe(24)
@@ -212,7 +215,20 @@ class LivePage:
         """To be opened in a browser; who has it may steer the run."""
         return f"http://{_HOST}:{self.port}/{self.token}/"
 
-    async def __aenter__(self) -> Self:
+    def __enter__(self) -> Self:
+        self._loop = asyncio.new_event_loop()
+        self._thread = Thread(target=self._loop.run_forever, daemon=True)
+        self._thread.start()
+        asyncio.run_coroutine_threadsafe(self._open(), self._loop).result()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        asyncio.run_coroutine_threadsafe(self._close(), self._loop).result()
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+    async def _open(self) -> None:
         self._server = await serve(
             self._attend,
             _HOST,
@@ -228,9 +244,8 @@ class LivePage:
         )
         (listener,) = self._server.sockets
         self.port = int(listener.getsockname()[1])
-        return self
 
-    async def __aexit__(self, *error: object) -> None:
+    async def _close(self) -> None:
         self._server.close()
         await self._server.wait_closed()
 
@@ -238,10 +253,13 @@ class LivePage:
         """What the player tells."""
         if isinstance(what, Start):
             self._start = what
+        self._loop.call_soon_threadsafe(self._send, kind, message(kind, what, self._start))
+
+    def _send(self, kind: str, text: str) -> None:
+        if kind == "start":
             self._frames.clear()
             self._latest.clear()
-        text = message(kind, what, self._start)
-        if kind == "frame":
+        if kind in ("frame", "failed"):  # in their order
             self._frames.append(text)
         else:
             self._latest[kind] = text
@@ -301,7 +319,7 @@ class LivePage:
             case ("speed", float(speed)) if speed in self._start.speeds:
                 self.player.set(speed=speed)
             case ("revise", bool(on)) if self._start.live:
-                self.player.revise(on)
+                self.player.set(revising=on)
             case ("restart", None):
                 self.player.restart()
             case ("case", float(case)) if case in range(len(self._start.cases)):
