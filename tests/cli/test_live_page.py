@@ -2,8 +2,9 @@
 
 import math
 import re
+import threading
 import time
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -185,6 +186,40 @@ def test_the_past_can_be_looked_at_and_left(seen):
     page.get_by_role("button", name="back to now").click()
     shows(page, "time", f"{end:.1f}")
     assert text(page, "mode").strip() == "ended"
+
+
+def test_where_nothing_comes_any_more_nothing_is_called_safe(seen):
+    goes, session = threading.Event(), cars()
+    step = session.step
+    session.step = lambda: goes.wait(60) and step()
+    goes.set()
+    page = seen(session=lambda: session)
+    shows(page, "headline", "No danger known")
+    page.evaluate("at = performance.now(); performance.now = () => at - 1e4")  # it waits for 10 s
+    goes.clear()
+    shows(page, "lost", "No decision comes")
+    shows(page, "headline", "Not watched now")
+    page.keyboard.press("Home")
+    shows(page, "headline", "No danger known")  # which it was then
+    session.step = lambda: 1 / 0
+    goes.set()
+    page.keyboard.press("l")
+    shows(page, "lost", "The run broke off: ZeroDivisionError")
+    playwright.expect(page.locator("#status")).to_have_attribute("data-status", "unjudged")
+    page.evaluate("delete performance.now")
+    session.step = step
+    page.get_by_role("button", name="Again").click()
+    shows(page, "headline", "No danger known")
+
+
+def test_a_page_whose_socket_is_refused_says_so(browser, shown, monkeypatch):
+    monkeypatch.setattr("evofsm.cli.watch.server._OWN_PAGE", re.compile("none"))
+    with shown(cars, paused=True) as live, closing(browser.new_page()) as page:
+        page.goto(live.address)
+        shows(page, "lost", "No connection to evofsm: it has ended, or refuses this address.")
+        assert (text(page, "headline"), text(page, "mode")) == ("Not watched now", "lost")
+        monkeypatch.undo()
+        shows(page, "headline", "Waiting for the run")
 
 
 def test_states_and_help_are_shown_and_the_theme_changes(seen):

@@ -69,6 +69,7 @@ def test_the_page_and_all_that_it_needs_are_served_under_its_address(page):
     status, headers, body = get(page, folder)
     assert status == 200
     assert b"<!doctype html>" in body
+    assert body.count(b'data-status="unjudged"') == body.count(b"<noscript>") == 1
     assert "default-src 'none'" in headers["Content-Security-Policy"]
     assert b"http:" not in body
     assert b"https:" not in body

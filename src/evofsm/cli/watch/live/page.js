@@ -9,33 +9,45 @@ import { drawPlane, marksDeadEnds, placeHere } from "./plane.js";
 const at = (id) => document.getElementById(id);
 const run = new Run();
 let socket = null;
+let met = false; // whether a socket was ever let in
+let came = performance.now(); // when something came at last
+const PATIENCE = 5000; // for a decision that is due [ms]
 
 // -- The run, as it comes ---------------------------------------------------------------------------
 
 function connect() {
   socket = new WebSocket(new URL("socket", location.href.replace(/^http/, "ws")));
   socket.onmessage = (event) => take(JSON.parse(event.data));
-  socket.onopen = () => { at("lost").hidden = true; };
+  socket.onopen = () => { met = true; };
   socket.onclose = (event) => {
-    complain(`The connection to evofsm is lost${event.reason ? ` (${event.reason})` : ""}. Trying again ...`);
-    at("mode").textContent = "lost";
+    const why = met ? `The connection to evofsm is lost${event.reason ? ` (${event.reason})` : ""}.`
+      : "No connection to evofsm: it has ended, or refuses this address. It answers to http://localhost and http://127.0.0.1.";
+    complain(`${why} Trying again ...`);
+    at("reviser").hidden = true; // nobody knows whether it is on
     setTimeout(connect, 1500);
   };
 }
 
 function take(message) {
+  came = performance.now();
   if (message.kind === "whole") message.parts.forEach(take);
   else if (message.kind === "failed") complain(`The run broke off: ${message.text}`);
   else run.take(message);
+  if (["start", "frame"].includes(message.kind)) complain("");
   if (message.kind === "start") showStart(message);
   if (message.kind === "clock") showControls();
   if (message.kind === "known") showKnown(message);
   changed = true;
 }
 
+/** Why nothing is watched now; with no words it is again. */
 function complain(words) {
+  if (at("lost").textContent === words) return;
   at("lost").textContent = words;
-  at("lost").hidden = false;
+  at("lost").hidden = !words;
+  at("mode").textContent = words ? "lost" : "waiting";
+  showStatus(run.latest);
+  changed = true;
 }
 
 const send = (what, value) => {
@@ -95,7 +107,7 @@ function showControls() {
 function showMode() {
   at("live").hidden = run.isLive;
   const mode = !run.isLive ? "past" : run.clock.over ? "ended" : run.clock.paused ? "paused" : run.start.live ? "live" : "shadow";
-  if (socket.readyState === WebSocket.OPEN) at("mode").textContent = mode;
+  if (at("lost").hidden) at("mode").textContent = mode;
   at("time").textContent = clock(run.shown, run.start);
   const scrub = at("scrub");
   scrub.max = span(run);
@@ -106,14 +118,23 @@ function showMode() {
 let told = null;
 function showStory() {
   const frame = run.frame;
-  if (!frame || frame === told) return;
+  if (!frame) return;
+  showStatus(frame);
+  if (frame === told) return;
   told = frame;
-  at("status").dataset.status = frame.told.status;
-  write("headline", frame.told.headline);
   for (const part of ["when", "why", "done", "outcome", "alone"]) write(part, frame.told[part]);
   const decision = run.decision;
   write("decision", `${decision.here}; ${decision.reason}`);
   write("experience", decision.explanation);
+}
+
+/** What a frame was; of now nothing is known where nothing comes, but how a run ended. */
+function showStatus(frame) {
+  const isUnknown = !at("lost").hidden && run.isLive && !frame?.over;
+  const { status, headline } = !isUnknown && frame ? frame.told
+    : { status: "unjudged", headline: isUnknown ? "Not watched now" : "Waiting for the run" };
+  at("status").dataset.status = status;
+  write("headline", headline);
 }
 
 /** Only what is new, so that screen readers say only that. */
@@ -212,6 +233,8 @@ function draw(now) {
   const time = run.shown;
   run.play(Math.min(0.25, (now - before) / 1000));
   before = now;
+  const due = came + PATIENCE + 1000 * (run.start?.interval ?? 0) / (run.clock.speed ?? Infinity);
+  if (now > due && run.start && at("lost").hidden && !run.clock.paused && !run.clock.over) complain("No decision comes: what is watched hangs, or takes long.");
   if (run.latest && (changed || run.shown !== time)) {
     if (changed || run.frame !== drawn) {
       at("playhead").style.top = `${drawPlots(plots, run)}px`;
