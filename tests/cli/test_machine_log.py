@@ -502,6 +502,7 @@ def test_a_log_of_any_machine_is_watched(evofsm, written):
         assert "nobody acts" in introduce(shown.start)["intro"]
         assert shown.graph().states
         frames = drive(shown)
+        assert not any("after a(1)" in frame.explanation for frame in frames)
         for frame in frames[:-1]:  # by the alarm that was chosen, and by no other one
             assert (frame.proposed_risk.risk > shown.start.tolerance) == (frame.reason[:2] != "no")
         before = [tell(frame, shown.start).headline for frame in frames[:-1]]

@@ -53,6 +53,15 @@ def test_an_episode_counts_once_for_each_state_and_action(seed, horizon):
             np.testing.assert_array_equal(getattr(one, name), counts, err_msg=name)
 
 
+def test_of_a_single_action_none_is_better():
+    machine = EvolvingFSM(1, rule=Novelty(radius=1.0))
+    for fails in [False, True] * 10:  # in a row after which nothing is done
+        rows = [[0.0], [4.0]] if fails else [[0.0], [4.0], [0.0]]
+        machine.learn_many(rows, [0] * len(rows), [0], [1] * fails)
+    said = machine.model().explain(1)
+    assert (said.here[:2], said.better) == ((10, 20), None)
+
+
 def test_where_states_were_joined_there_is_no_interval():
     machine = EvolvingFSM(1, rule=Novelty(radius=1.0), max_states=2)
     for episode in range(6):

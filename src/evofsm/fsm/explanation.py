@@ -126,13 +126,13 @@ def _never_seen(known: Any, belief: Floats, nearest: Nearest, labels: Labels) ->
 
 
 def _best(after: Sequence[Tally], than: Tally) -> int | None:
-    """The action whose interval ends lowest, if that is lower and a smaller share failed."""
+    """Of several the action whose interval ends lowest, if lower, and a smaller share failed."""
     better = [
         (tally.interval[1], action)
         for action, tally in enumerate(after)
         if tally.share < than.share and tally.interval[1] < than.interval[1]
     ]
-    return min(better)[1] if better else None
+    return min(better)[1] if better and len(after) > 1 else None
 
 
 def _of_place(known: Any, belief: Floats, state: int, labels: Labels) -> str:

@@ -722,7 +722,9 @@ class Guard:
             return revision
         if not (self.explaining or is_spoken(self.reviser, revision)):
             return revision
-        action = self.actions.encode(put_into(self.actions, revision.executed))
+        action = None
+        if self.actions.n_actions > 1:  # else nobody acts
+            action = self.actions.encode(put_into(self.actions, revision.executed))
         if self._frozen is None:
             text = self.machine.explain(action, self._labels).text
         else:
