@@ -516,5 +516,10 @@ def test_a_log_of_any_machine_is_watched(evofsm, written):
         while not (frame := shown.step()).over:
             assert tell(frame, shown.start).headline == "No alarm"
         assert tell(frame, shown.start).why == "No limit of its alarm was passed."
+    assert shown.start.about == "row by row."
+    zoned = polars.col("Zeit").dt.replace_time_zone("Europe/Berlin")
+    polars.read_parquet(path).with_columns(zoned).write_parquet(path)
+    about = watched_log(path, reading, guard=Guard.load("guard.evofsm")).start.about
+    assert about == "row by row; times of day are told in UTC."
     with pytest.raises(ValueError, match="is of no cars: --guard names a guard"):
         watched_log(path, reading)

@@ -33,7 +33,7 @@ from evofsm.guard.actions import Action, Choices, change, is_usable, limits, put
 from evofsm.guard.api import BELIEF_TOLERANCE, TOLERANCE, Judgement, Proposal, Revision, Situation
 from evofsm.guard.foresight import DATES
 from evofsm.io.logs import LONGEST_STEP, Chunk, LogColumns, Noted
-from evofsm.io.tables import date
+from evofsm.io.tables import IN_UTC, date
 
 #: The state rule for looking on: coarse enough that each state can be told from the others.
 WATCHED_RULE = Novelty(radius=2.0, scales=(4.0, 2.0, 2.0))
@@ -397,7 +397,8 @@ def watched_log(
         names = VARIABLES  # which may be called otherwise in the log
     if guard is None and not of_cars:
         raise ValueError(f"{path} is of no cars: --guard names a guard (evofsm learn --guard)")
-    episodes = episodes_read(path, columns, Noted(), dated=not of_cars)
+    notes = Noted()
+    episodes = episodes_read(path, columns, notes, dated=not of_cars)
     stretches = list(_of_cars(episodes, collisions) if of_cars else _whole(episodes))
     if not stretches:
         why = f"nobody follows anybody for {_SHOWS}" if of_cars else "no episode has two"
@@ -422,6 +423,8 @@ def watched_log(
     if isinstance(guard.judge, Foresight):
         stretches = list(_alarmed(guard.judge, guard.judge.alarm, stretches))
     system = Logged(path, stretches, guard, acts=columns.acts, of_cars=of_cars)
+    if notes.in_utc and rows[0].times[0] >= DATES:
+        system.about = f"row by row; {IN_UTC}."
     return Session(system, case=system.first if case is None else case - 1, on=False)
 
 
