@@ -73,6 +73,10 @@ def test_the_page_and_all_that_it_needs_are_served_under_its_address(page):
     assert "default-src 'none'" in headers["Content-Security-Policy"]
     assert b"http:" not in body
     assert b"https:" not in body
+    for query in ("", "?from=here"):
+        assert get(page, folder + query)[0] == 200
+        status, headers, _ = get(page, folder.rstrip("/") + query)
+        assert (status, headers["Location"]) == (308, f"{page.token}/")
     for name in page._files:
         status, headers, body = get(page, folder + name)
         assert status == 200

@@ -194,10 +194,7 @@ def message(kind: str, what: Any, start: Start | None = None) -> str:
 
 
 class LivePage:
-    """Serves a run to browsers on this computer, in ``with``; the audience of a `Player`.
-
-    It has a thread of its own, and answers also where what is watched takes long.
-    """
+    """Serves a run to browsers on this computer, in a thread; the audience of a `Player`."""
 
     def __init__(self) -> None:
         self.token = secrets.token_urlsafe(24)
@@ -270,7 +267,7 @@ class LivePage:
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """The files of the page; None lets a socket be opened."""
-        token, _, name = request.path.removeprefix("/").partition("/")
+        token, slash, name = request.path.partition("?")[0].removeprefix("/").partition("/")
         hosts, origins = (request.headers.get_all(header) for header in ("Host", "Origin"))
         if len(hosts) != 1 or not _OWN.fullmatch(hosts[0]):
             return _refusal(HTTPStatus.FORBIDDEN, _FOREIGN.format(self.port))
@@ -281,6 +278,10 @@ class LivePage:
             if len(origins) != 1 or not _OWN_PAGE.fullmatch(origins[0]):
                 return _refusal(HTTPStatus.FORBIDDEN, "Only the page itself may open the socket.")
             return None
+        if not slash:  # below which its files are
+            answer = _refusal(HTTPStatus.PERMANENT_REDIRECT, "The address ends with a slash.")
+            answer.headers["Location"] = f"{token}/"
+            return answer
         name = name or "page.html"
         if name not in self._files:
             return _refusal(HTTPStatus.NOT_FOUND, "There is no such file.")
