@@ -194,7 +194,10 @@ def message(kind: str, what: Any, start: Start | None = None) -> str:
 
 
 class LivePage:
-    """Serves a run to browsers on this computer, in a thread; the audience of a `Player`."""
+    """Serves a run to browsers on this computer; the audience of a `Player`.
+
+    In ``async with`` it serves in that loop, in ``with`` in a thread of its own.
+    """
 
     def __init__(self) -> None:
         self.token = secrets.token_urlsafe(24)
@@ -213,19 +216,19 @@ class LivePage:
         return f"http://{_HOST}:{self.port}/{self.token}/"
 
     def __enter__(self) -> Self:
-        self._loop = asyncio.new_event_loop()
-        self._thread = Thread(target=self._loop.run_forever, daemon=True)
+        loop = asyncio.new_event_loop()
+        self._thread = Thread(target=loop.run_forever, daemon=True)
         self._thread.start()
-        asyncio.run_coroutine_threadsafe(self._open(), self._loop).result()
-        return self
+        return asyncio.run_coroutine_threadsafe(self.__aenter__(), loop).result()
 
     def __exit__(self, *error: object) -> None:
-        asyncio.run_coroutine_threadsafe(self._close(), self._loop).result()
+        asyncio.run_coroutine_threadsafe(self.__aexit__(), self._loop).result()
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
         self._loop.close()
 
-    async def _open(self) -> None:
+    async def __aenter__(self) -> Self:
+        self._loop = asyncio.get_running_loop()
         self._server = await serve(
             self._attend,
             _HOST,
@@ -241,8 +244,9 @@ class LivePage:
         )
         (listener,) = self._server.sockets
         self.port = int(listener.getsockname()[1])
+        return self
 
-    async def _close(self) -> None:
+    async def __aexit__(self, *error: object) -> None:
         self._server.close()
         await self._server.wait_closed()
 
