@@ -472,6 +472,20 @@ def test_episodes_that_an_environment_begins_by_itself_are_learnt(monkeypatch, w
     assert ["reset()" in str(one.message) for one in heard] == [True] * (wrap is Again and not name)
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_what_is_put_back_at_once_failed_where_it_was_and_begins_an_episode(name):
+    class Back(Script):
+        def step(self, action):
+            seen, *said, info = super().step(action)
+            return (FAR, *said, info | {name: seen}) if seen is HIT else (seen, *said, info)
+
+    env = Back(NEAR, HIT, NEAR)
+    env = RevisedActions(env, guard_for(ONE), failed=lambda step: step.observation[0] < 0.0)
+    drive(env, lambda *_: np.array([0.0]))
+    rows = [([(tuple(seen), (0.0,))], tuple(last)) for seen, last in ((NEAR, HIT), (FAR, NEAR))]
+    assert env.guard.judge.episodes == [(*rows[0], True), (*rows[1], False)]
+
+
 @pytest.mark.parametrize("way", ["call reset", "observe returned None", "many: observe returned"])
 def test_who_is_attached_and_never_decides_says_so(way):
     class Over(Script):

@@ -125,8 +125,9 @@ class RevisedActions(_Settled, gymnasium.Wrapper[Any, Any, Any, Any], RecordCons
     Notes
     -----
     A proposal that is kept is passed on untouched. A failure ends the guard's episode; where the
-    environment goes on, proposals pass until ``failed`` says no again, where the next one begins. A
-    failure right after nothing was judged is not counted.
+    environment goes on, proposals pass until ``failed`` says no again, where the next one begins,
+    or in that step, if it puts the last observation in ``info["final_obs"]`` and returns the next
+    episode's. A failure right after nothing was judged is not counted.
 
     Examples
     --------
@@ -393,12 +394,13 @@ class Lane:
             if not is_over:  # it began the next episode by itself
                 self.begin(now.observation, now.info)
             return
-        last = [step.info[name] for name in _LAST if name in step.info]
-        resets = is_over and (resets or bool(last))
-        if resets:
+        last = [step.info[name] for name in _LAST if step.info.get(name) is not None]
+        if last or (is_over and resets):
             info = step.info.get("final_info", step.info)
             step = replace(step, observation=last[0] if last else None, info=info)
         failed = self.terms.failed(step)
+        is_over |= failed and bool(last)  # it was put back at once
+        resets = is_over and (resets or bool(last))
         self._score += np.sum(step.reward)
         self._look(step.observation, step.info)
         if failed or is_over or self.seen is None:
