@@ -893,6 +893,18 @@ def test_whom_anothers_failure_ends_did_not_end_by_itself():
     assert ended == [(True, False), (False, False)]
 
 
+@pytest.mark.parametrize("name", ["black_death_par", "DelayObsModifier", "StickyActionsModifier"])
+def test_what_hides_agents_from_the_guard_is_named(name):
+    kind = type(name, (pettingzoo.utils.BaseParallelWrapper,), {})
+    env = kind(Crowd(2))
+    if name.endswith("Modifier"):  # as SuperSuit keeps them
+        env = pettingzoo.utils.BaseParallelWrapper(Crowd(2))
+        env.modifier_class = kind
+    with pytest.warns(UserWarning, match=f"{name} below the guard .*that in {name}") as told:
+        RevisedAgents(pettingzoo.utils.BaseParallelWrapper(env), guard_for(ONE), failed=bool)
+    assert len(told) == 1
+
+
 def test_agents_that_observe_differently_are_refused():
     sizes, observe = iter((1, 2)), lambda z: z[: next(sizes)]
     env = RevisedAgents(Crowd(2, 4), guard_for(ONE), observe=observe)

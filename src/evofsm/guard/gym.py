@@ -648,7 +648,10 @@ def warn_of(env: Any, guard: Guard, failed: Failed | None) -> None:
             stacklevel=3,
         )
     for layer in _layers(env):
-        name, attributes, why = type(layer).__name__, getattr(layer, "__dict__", ()), ""
+        attributes, why = getattr(layer, "__dict__", {}), ""
+        # SuperSuit has one wrapper, for each agent's modifier or for the only one.
+        kind = attributes.get("modifier_class", type(attributes.get("modifier", layer)))
+        name = kind.__name__
         updates = getattr(layer, "update_running_mean", getattr(layer, "training", True))
         uses_reward = "reward" in getattr(getattr(failed, "__code__", None), "co_names", ())
         if "obs_rms" in attributes and updates:
@@ -657,8 +660,10 @@ def warn_of(env: Any, guard: Guard, failed: Failed | None) -> None:
             why = "rescales the reward, which failed looks at, by statistics that change"
         elif name.startswith("Sticky"):
             why = "executes other actions than the guard decides on"
-        elif name == "DelayObservation" and layer.delay > 1:
+        elif name.startswith("DelayObs") and attributes.get("delay", math.inf) > 1:
             why = "shows the guard where the system was, not where it is"
+        elif name.startswith("black_death"):
+            why = "hides which agents failed, and goes on with zeros, until all are done"
         if why:
             hint = f"Wrap the environment in the guard first, and that in {name}"
             fault = f"{name} below the guard {why}: it learns badly, or nothing"
