@@ -558,13 +558,26 @@ def test_two_loops_that_feed_one_guard_by_turns_are_told():
 
 def test_what_is_learnt_in_another_process_does_not_come_back():
     guard, here = guard_for(Discrete(2)), os.getpid()
-    why = r"made in another process.*SyncVectorEnv"
+    why = r"a copy, made for another process.*SyncVectorEnv"
 
     def make():
         with nullcontext() if os.getpid() == here else pytest.warns(UserWarning, match=why):
             return RevisedActions(cart(), guard)
 
     AsyncVectorEnv([make]).close()
+
+
+def test_what_the_copy_learns_that_gymnasium_makes_does_not_come_back(monkeypatch):
+    guard, registry = guard_for(Discrete(2)), gymnasium.registry.copy()
+    monkeypatch.setattr(gymnasium.envs.registration, "registry", registry)
+    gymnasium.register("Kept-v0", lambda kept: RevisedActions(cart(), kept), kwargs={"kept": guard})
+    spec = wrappers.TimeLimit(RevisedActions(cart(), guard), 9).spec
+    for name in ("Kept-v0", spec):
+        with pytest.warns(UserWarning, match=r"a copy, .* by gym.make.*wrap those that gym.make"):
+            assert gymnasium.make(name).get_wrapper_attr("guard") is not guard
+    with warnings.catch_warnings(action="error"):
+        warnings.filterwarnings("ignore", message="nobody says which")
+        assert gymnasium.make("Kept-v0", kept=guard).get_wrapper_attr("guard") is guard
 
 
 def test_a_log_that_follows_one_episode_refuses_a_second_environment(tmp_path):

@@ -320,7 +320,8 @@ class Guard:
         if not (audit is None or hasattr(audit, "decided")):
             raise TypeError(f"audit is {audit!r}, which has no method decided")
         share(self)
-        self.process = os.getpid()  #: in which it was made; a copy elsewhere learns for itself
+        #: In which it was made; None of what was copied as Python does, which learns for itself.
+        self.process: int | None = os.getpid()
         self.actions = reviser.actions
         self.interval = positive("interval", interval)
         action_judge: Any = getattr(reviser, "risk", judge)
@@ -845,11 +846,11 @@ class Guard:
             lines.append(f"failure: {words}")
         return "\n".join(lines)
 
-    # What another process gets has a lock of its own.
+    # What another process gets has a lock of its own, and what it learns there stays there.
     @alone
     def __getstate__(self) -> dict[str, Any]:
         state = {name: vars(self)[name] for name in vars(self) if name not in ("_lock", "_call")}
-        return state | {"audit": None}  # which is the file of this one
+        return state | {"audit": None, "process": None}  # an audit log is the file of this one
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)

@@ -637,9 +637,9 @@ def _layers(env: Any) -> Iterator[Any]:
 def warn_of(env: Any, guard: Guard, failed: Failed | None) -> None:
     """Name what stands below a guard and keeps it from learning, or others from what it learns."""
     if guard.learn and guard.process != os.getpid():
-        fault = "the guard was made in another process, and what it learns in this one stays here"
-        hint = "run the environments in one process (DummyVecEnv, SyncVectorEnv), or save it here"
-        warnings.warn(f"{fault}: {hint}", stacklevel=3)
+        fault = "the guard is a copy, made for another process or by gym.make: it learns for itself"
+        hint = "Run the environments in one process (DummyVecEnv, SyncVectorEnv), wrap those that "
+        warnings.warn(f"{fault}. {hint}gym.make returns, or save this guard", stacklevel=3)
     if failed is None and guard.failed is None and guard.learn:
         warnings.warn(
             "nobody says which episodes failed: all that are terminated are taken to have. If so, "
