@@ -50,6 +50,7 @@ class Script(gymnasium.Env):
     """Shows one observation after another, whatever is done, and remembers what was."""
 
     observation_space = Box(-100.0, 1000.0, (3,), np.float64)
+    reward = 1.5
 
     def __init__(self, *seen, action_space=ONE, terminates=True, failed=False):
         self.action_space = action_space
@@ -70,7 +71,7 @@ class Script(gymnasium.Env):
         self.row += 1
         last = self.row + 1 == len(self.seen)
         info = {"of": "step", "failed": last and self.failed}
-        return self.seen[self.row], 1.5, last and self.terminates, False, info
+        return self.seen[self.row], self.reward, last and self.terminates, False, info
 
 
 class Spy(LearningJudge):
@@ -223,8 +224,10 @@ def test_actions_that_are_not_the_guards_are_refused(space, guarded):
         (Box(-2.0, 2.0, (), np.float32), 1.0, 0.5, 0.25),
     ],
 )
-@pytest.mark.parametrize("penalty", [0.0, 3.0])
-def test_a_change_is_executed_and_can_cost_reward(space, proposed, executed, size, penalty):
+@pytest.mark.parametrize(
+    ("penalty", "paid"), [(0.0, 1.5), (3.0, 1.5), (3.0, np.array([1.5])), (3.0, np.ones(2))]
+)
+def test_a_change_is_executed_and_can_cost_reward(space, proposed, executed, size, penalty, paid):
     def dangerous(action):
         return (np.asarray(action) > 0.5).any() if isinstance(space, Box) else action == 2
 
@@ -235,6 +238,7 @@ def test_a_change_is_executed_and_can_cost_reward(space, proposed, executed, siz
             return Search(options, self.judge(situation, options), best, "nearest")
 
     script = Script(FAR, FAR, FAR, action_space=space)
+    script.reward = paid
     within = Box(-2.0, 2.0, space.shape) if isinstance(space, Box) else space
     env = RevisedActions(script, guard_for(within, Half(dangerous)), penalty=penalty)
     env.reset()
@@ -248,7 +252,8 @@ def test_a_change_is_executed_and_can_cost_reward(space, proposed, executed, siz
     assert np.array_equal(info["reviser/executed_action"], executed)
     assert np.array_equal(script.executed, [executed])
     assert info["reviser/penalty"] == pytest.approx(size)
-    assert reward == pytest.approx(1.5 - penalty * size)
+    assert np.shape(reward) == np.shape(paid)
+    assert reward == pytest.approx(paid - penalty * size)
 
 
 def test_what_does_not_fit_is_named():

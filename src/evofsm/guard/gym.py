@@ -109,8 +109,9 @@ class RevisedActions(_Settled, gymnasium.Wrapper[Any, Any, Any, Any], RecordCons
         LunarLander and BipedalWalker, ``lambda step: False`` for never, as in MountainCar and
         Acrobot. By default what the guard says itself, or else ``"terminated"``, with a warning.
     penalty : float
-        Subtracted from the reward per unit of ``reviser/penalty``: half ranges of the action, in a
-        box the root of the sum of squares over its components; 1 for another index. Of what
+        Subtracted from the reward (of several from each) per unit of ``reviser/penalty``: half
+        ranges of the action, in a box the root of the sum of squares over its components; 1 for
+        another index. Of what
         ``studies peers`` tried 1 is best: at 0 a policy leans on the guard, and fails by itself.
 
     Raises
@@ -312,9 +313,11 @@ class Decided(NamedTuple):
     info: dict[str, Any]
     cost: float  #: subtracted from the reward
 
-    def paid(self, reward: SupportsFloat) -> SupportsFloat:
-        """The reward less the cost."""
-        return float(reward) - self.cost if self.cost else reward
+    def paid(self, reward: Any) -> Any:
+        """The reward less the cost; of several, each."""
+        if not self.cost:
+            return reward
+        return (float(reward) if np.ndim(reward) == 0 else np.asarray(reward)) - self.cost
 
 
 class Lane:
