@@ -274,6 +274,9 @@ def test_what_does_not_fit_is_named():
     for penalty in (-1.0, math.nan, math.inf):
         with pytest.raises(ValueError, match="penalty"):
             RevisedActions(Script(FAR), guard_for(ONE), penalty=penalty)
+    env.env.step = lambda action: (FAR, 0.0, 0.0, False, False, {})  # as Safety-Gymnasium
+    with pytest.raises(ValueError, match=r"step returned 6 values, .* a cost belongs in info"):
+        env.step(np.array([0.5]))
     for name, given in product(("failed", "observe"), ("failed", {"failed": True})):
         with pytest.raises(TypeError, match=f"{name} is .* it must be a function, such as"):
             RevisedActions(Script(FAR), guard_for(ONE), **{name: given})

@@ -181,7 +181,7 @@ class RevisedActions(_Settled, gymnasium.Wrapper[Any, Any, Any, Any], RecordCons
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Execute the guard's revision of ``action``."""
         was_open, decision = self._lane.is_open, self._lane.decide(action)
-        observation, reward, terminated, truncated, info = self.env.step(decision.executed)
+        observation, reward, terminated, truncated, info = five(self.env.step(decision.executed))
         self._lane.follow(StepResult(observation, reward, bool(terminated), bool(truncated), info))
         if self._lane.is_open and not was_open and not self._resets_itself:
             self._resets_itself = True
@@ -275,7 +275,7 @@ class RevisedVectorActions(_Settled, VectorWrapper[Any, Any, Any, Any, Any]):
         space = self.single_action_space
         buffer: Any = create_empty_array(space, self.num_envs)
         executed = concatenate(space, [decision.executed for decision in decisions], buffer)
-        observations, rewards, terminated, truncated, infos = self.env.step(executed)
+        observations, rewards, terminated, truncated, infos = five(self.env.step(executed))
         rows = iterate(self.env.observation_space, observations)
         for k, (lane, observation) in enumerate(zip(self._lanes, rows, strict=True)):
             ends, info = (bool(terminated[k]), bool(truncated[k])), _of_one(infos, k, self.num_envs)
@@ -612,6 +612,15 @@ def refuse_unless(fits: bool, env: Any) -> None:
             "PettingZoo, as parallel_env() makes it, or pettingzoo.utils.aec_to_parallel(env); "
             "wrap the single environments of a VecEnv of Stable-Baselines3"
         )
+
+
+def five(parts: Any) -> Any:
+    """What a step returned, unless it has other parts than those of Gymnasium."""
+    if len(parts) != 5:
+        fault = f"the environment's step returned {len(parts)} values, not 5 as Gymnasium has them"
+        hint = "a cost belongs in info['cost'], where SafetyGymnasium2Gymnasium puts its own"
+        raise ValueError(f"{fault}: {hint}")
+    return parts
 
 
 def _spaces(env: Any) -> tuple[Space[Any], Space[Any]]:

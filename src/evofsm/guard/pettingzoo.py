@@ -84,7 +84,7 @@ class RevisedAgents(gym._Settled, BaseParallelWrapper[Any, Any, Any]):  # type: 
         """Execute the guard's revision of each agent's action."""
         decisions = {agent: self._enter(agent).decide(action) for agent, action in actions.items()}
         executed = {agent: decision.executed for agent, decision in decisions.items()}
-        observations, rewards, terminated, truncated, infos = self.env.step(executed)
+        observations, rewards, terminated, truncated, infos = gym.five(self.env.step(executed))
         infos, rewards = dict(infos), dict(rewards)
         alive, steps = {*self.env.agents}, dict[Any, StepResult]()
         for agent in (agent for agent, lane in self._lanes.items() if lane.is_open):
