@@ -6,6 +6,7 @@ import math
 import os
 import re
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from itertools import product
 from pathlib import Path
@@ -524,6 +525,23 @@ def test_environments_that_take_turns_may_share_a_guard(monkeypatch):
             env.reset()
     assert guard.judge.episodes == Recorder.ended
     assert len(Recorder.ended) > 9
+
+
+def test_threads_with_an_environment_each_may_share_a_guard(monkeypatch):
+    monkeypatch.setattr(Recorder, "ended", [])
+    guard = guard_for(Discrete(2))
+    envs = [RevisedActions(Recorder(cart(steps=15)), guard) for _ in range(2)]
+    for env in envs:
+        env.reset(seed=0)
+
+    def drive_some(env):
+        for seed in range(4):
+            drive(env, lambda *_: env.action_space.sample(), seed=seed)
+
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(drive_some, envs))
+    assert sorted(guard.judge.episodes) == sorted(Recorder.ended)
+    assert len(Recorder.ended) == 8
 
 
 def test_of_an_episode_amid_which_another_environment_begins_the_rest_is_learnt():

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from operator import attrgetter
+from threading import RLock
 from typing import Any, Literal, NamedTuple, SupportsFloat
 from weakref import WeakKeyDictionary, WeakSet
 
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm.extras import needs
+from evofsm.fsm.sharing import alone
 from evofsm.fsm.validation import Floats, function
 from evofsm.guard.actions import (
     Action,
@@ -94,8 +96,8 @@ class RevisedActions(_Settled, gymnasium.Wrapper[Any, Any, Any, Any], RecordCons
     guard : Guard
         What is executed always lies in its set of actions, and is allowed where the environment
         has an action mask: in ``info["action_mask"]``, in an observation that is a dictionary, or
-        by a method ``action_masks``. Environments that take turns may share it; it then learns as
-        `RevisedVectorActions` does.
+        by a method ``action_masks``. Environments that take turns, or have a thread each, may share
+        it; it then learns as `RevisedVectorActions` does.
     observe : callable, optional
         From an observation of ``env`` to the guard's; to None where there is nothing to judge,
         such as no car ahead: then nothing is revised or learnt. NaN is what was not observed.
@@ -323,6 +325,8 @@ class Decided(NamedTuple):
 class Lane:
     """The episodes of one environment, or of one agent, under a guard or a twin of a shared one."""
 
+    _lock = RLock()  # threads, an environment each, take turns
+
     def __init__(self, terms: Terms, *, shared: bool, env: Any = None) -> None:
         if shared and terms.guard.audit is not None:
             raise ValueError("an audit log follows one episode at a time; give a guard without one")
@@ -337,6 +341,7 @@ class Lane:
         self._mask: Mask | None = None
         self._past: list[tuple[Floats, Proposal, Action]] = []
 
+    @alone
     def begin(self, observation: Any, info: Mapping[str, Any]) -> None:
         """An episode of the environment begins."""
         _LANES.setdefault(self.terms.guard, WeakSet()).add(self)
@@ -349,6 +354,7 @@ class Lane:
             mask = _of_combinations(self.terms.space, self._allowed(observation, info))
             self._mask = checked_mask(self.terms.guard.actions, mask)
 
+    @alone
     def decide(self, action: Any) -> Decided:
         """What to execute; the action itself where there is nothing to judge, or to decide."""
         terms, proposal = self.terms, Proposal(self.terms.to_guard(action), self._mask)
@@ -390,6 +396,7 @@ class Lane:
         self._episode = decider.begin()
         return decider
 
+    @alone
     def follow(self, step: StepResult, *, resets: bool = False) -> None:
         """What followed in the environment; ``resets`` says that what ends begins anew with it."""
         is_over, now = step.terminated or step.truncated, step
@@ -413,6 +420,7 @@ class Lane:
         if resets:
             self.begin(now.observation, now.info)
 
+    @alone
     def end(self, *, failed: bool, terminated: bool = False, score: float | None = None) -> None:
         """The guard's episode ends, if one is under way."""
         decider, guard = self._guard, self.terms.guard
@@ -470,7 +478,7 @@ class Terms:
         is_silent = why and (ever or not self._has_decided)
         self._silent = self._silent + 1 if is_silent else 0
         if self._silent == _SILENT:
-            warnings.warn(f"nothing was decided in {_SILENT} steps on end: {why}", stacklevel=4)
+            warnings.warn(f"nothing was decided in {_SILENT} steps on end: {why}", stacklevel=5)
 
     def unjudged(self, proposal: Proposal, why: str) -> Revision:
         """The proposal, made usable, where nothing is judged."""
