@@ -4,6 +4,7 @@ import copy
 import importlib
 import math
 import os
+import pickle
 import re
 import warnings
 from concurrent.futures import ThreadPoolExecutor
@@ -604,6 +605,26 @@ def test_what_the_copy_learns_that_gymnasium_makes_does_not_come_back(monkeypatc
     with warnings.catch_warnings(action="error"):
         warnings.filterwarnings("ignore", message="nobody says which")
         assert gymnasium.make("Kept-v0", kept=guard).get_wrapper_attr("guard") is guard
+
+
+class Allowing(Script):
+    allowed = (1, 1, 1)
+
+    def action_masks(self):
+        return self.allowed
+
+
+@pytest.mark.parametrize("how", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_of_what_is_wrapped_goes_on_by_itself_and_asks_itself_what_is_allowed(how):
+    env = Allowing(*[FAR] * 9, action_space=Discrete(3))
+    env = RevisedActions(env, guard_for(env.action_space, Spy(np.isnan)))
+    env.reset()
+    twin = how(env)
+    env.env.allowed = (1, 0, 0)
+    for one, executed in ((env, 0), (twin, 2)):
+        said = [one.step(2)[-1]["reviser/executed_action"] for _ in range(3)]
+        assert said == [2, executed, executed]
+    assert twin.guard is not env.guard
 
 
 def test_a_log_that_follows_one_episode_refuses_a_second_environment(tmp_path):

@@ -461,6 +461,7 @@ class Terms:
             function("failed", failed, _FAILED)
         if not isinstance(guard, Guard):
             raise TypeError(f"guard is {guard!r}; it must be a Guard, as Guard.load(path) reads it")
+        self._given = guard, observations, actions, observe, failed, penalty
         self.guard, self.space, self.penalty = guard, actions, penalty
         self._silent, self._has_decided = 0, False
         self._observe, self._failed = observe or _flat(observations), failed
@@ -468,6 +469,9 @@ class Terms:
         if not observe and guard.variables != keys and {*guard.variables} == {*keys}:
             raise ValueError(f"names are {guard.variables}, but the Dict is taken in order: {keys}")
         self.to_guard, self._to_env = _conversions(actions, guard.actions)
+
+    def __reduce__(self) -> Any:  # made anew where copied, as its functions are of no module
+        return Terms, self._given
 
     def say_if_silent(self, why: str = "", *, ever: bool = True) -> None:
         """Count steps on end without a decision; warn, saying why, where they are many.

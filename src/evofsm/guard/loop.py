@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from time import perf_counter
 from typing import Any, NamedTuple, Protocol, SupportsFloat
 
@@ -116,14 +117,14 @@ def action_masks(environment: Any) -> Callable[[Any, Mapping[str, Any]], Any]:
         ask = find("action_masks") if find else environment.action_masks
     except AttributeError:
         ask = None
+    return partial(_mask, ask)  # which a copy of the environment asks of itself
 
-    def now(observation: Any, info: Mapping[str, Any]) -> Any:
-        for source in (observation, info):
-            if isinstance(source, Mapping) and source.get("action_mask") is not None:
-                return source["action_mask"]
-        return ask() if ask else None
 
-    return now
+def _mask(ask: Callable[[], Any] | None, observation: Any, info: Mapping[str, Any]) -> Any:
+    for source in (observation, info):
+        if isinstance(source, Mapping) and source.get("action_mask") is not None:
+            return source["action_mask"]
+    return ask() if ask else None
 
 
 def _whole(observation: Any, held: Floats | None) -> Floats:
