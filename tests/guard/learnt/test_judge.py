@@ -138,6 +138,15 @@ def test_what_failed_where_something_was_survived_is_said_to_fail_there():
     assert "fails where variable 1 is at or above 3" in str(guard)
 
 
+def test_who_decides_once_an_episode_is_told_that_nothing_is_learnt():
+    guard = Guard(n_actions=3, interval=1.0)
+    for x in np.linspace(-1.0, 1.0, 20):
+        reason = guard.decide([x, 0.0], 2).reason
+        guard.end(bool(x > 0.0), [x, 10.0 * (x > 0.0)], terminated=True)
+    for text in (reason, str(guard)):
+        assert "nothing was learnt: no episode had three observations in a row" in text
+
+
 def test_told_what_failure_is_it_keeps_from_the_first_one(point):
     guard = point.guard(failed=lambda z: z[0] >= 1.0, shadow=False)
     assert sum(point.play(guard, k)[1] for k in range(6)) <= 1

@@ -172,7 +172,7 @@ def experience(
         more += f"; ends by itself {' or '.join(ends)}"
     if fatal_places:
         more += f"; nothing survives what begins {' or '.join(fatal_places)}"
-    if not there:
+    if not there or nothing == NEVER_WHOLE:
         return nothing + more
     if state.differs:
         more += f"; failed= says otherwise in {state.differs:.1%} of the states around, where this "
