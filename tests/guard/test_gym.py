@@ -421,6 +421,18 @@ def test_a_wrapper_under_which_nothing_can_be_learnt_is_named(name, given, told,
     getattr(wrappers, name)(RevisedActions(cart(), guard, **how), *given)  # as it was advised
 
 
+def test_a_list_of_infos_is_made_above_the_guard():
+    def listed(env):
+        return wrappers.vector.DictInfoToList(env)
+
+    many, guard = SyncVectorEnv([cart] * 2), guard_for(Discrete(2))
+    with pytest.warns(UserWarning, match=r"DictInfoToList below the guard .*in DictInfoToList"):
+        RevisedVectorActions(listed(many), guard)
+    env = listed(RevisedVectorActions(many, guard))  # as it was advised
+    env.reset(seed=0)
+    assert ["reviser/reason" in info for info in env.step([1, 1])[-1]] == [True, True]
+
+
 def test_statistics_that_change_no_more_are_as_good_as_none():
     frozen = wrappers.NormalizeObservation(cart())
     frozen.update_running_mean = False

@@ -686,6 +686,8 @@ def warn_of(env: Any, guard: Guard, failed: Failed | None) -> None:
             why = "executes other actions than the guard decides on"
         elif name.startswith("DelayObs") and attributes.get("delay", math.inf) > 1:
             why = "shows the guard where the system was, not where it is"
+        elif name == "DictInfoToList":
+            why = "makes a list of infos, in which a dictionary is read"
         elif name.startswith("black_death"):
             why = "hides which agents failed, and goes on with zeros, until all are done"
         if why:
