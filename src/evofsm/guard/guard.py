@@ -146,7 +146,7 @@ class Guard:
         Range of the action, where that is one number; of each component where they are arrays:
         then actions are vectors, also of length 1.
     n_actions : int, optional
-        Number of actions, where an action is an index from 0.
+        Number of actions, where an action is an index from 0; texts call the first a(1).
     interval : float
         Time between two decisions [s].
     judge : ActionJudge, optional
