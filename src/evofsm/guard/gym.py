@@ -674,8 +674,7 @@ def warn_of(env: Any, guard: Guard, failed: Failed | None) -> None:
     for layer in _layers(env):
         attributes, why = getattr(layer, "__dict__", {}), ""
         # SuperSuit has one wrapper, for each agent's modifier or for the only one.
-        kind = attributes.get("modifier_class", type(attributes.get("modifier", layer)))
-        name = kind.__name__
+        name = attributes.get("modifier_class", type(attributes.get("modifier", layer))).__name__
         updates = getattr(layer, "update_running_mean", getattr(layer, "training", True))
         uses_reward = "reward" in getattr(getattr(failed, "__code__", None), "co_names", ())
         if "obs_rms" in attributes and updates:
