@@ -293,19 +293,35 @@ def test_who_skips_steps_is_told_that_nobody_looked(road):
     assert max(abs(one.deed) for one in told) < 9.1
 
 
-def test_who_sets_the_speed_of_a_guarded_car_is_told_that_it_is_not_guarded(road):
-    sumo = road(*NO_GAP)
+@pytest.mark.parametrize("driver", ["hasty", "usual"])  # whose guard acts, or has no need to
+def test_who_sets_the_speed_of_a_guarded_car_is_told_that_it_is_not_guarded(road, driver):
+    sumo = road(*NO_GAP, others=USUAL)
+    sumo.vehicle.setType("ego", driver)
     guards = attach(sumo, ["ego"])
 
     def script():
         for _ in range(200):
             sumo.vehicle.setSpeedMode("ego", 0)
             sumo.vehicle.setSpeed("ego", 20.0)
-            drive(sumo, 0.1)
+            drive(sumo, 0.1, brakes_at=15.0 if driver == "hasty" else np.inf)
 
     with pytest.warns(RuntimeWarning, match="car ego drove otherwise than its guard"):
         script()
     assert guards.guarding.overruled > 5
+
+
+def test_a_model_that_under_a_limit_drives_a_little_slower_than_it_says_is_no_script(road):
+    """EIDM does."""
+    vehicle = (sumo := road(*NO_GAP)).vehicle
+    guards = attach(sumo, ["ego"])
+
+    def says(car):
+        return vehicle.getSpeedWithoutTraCI(car) + 0.02 * (vehicle.getSpeedMode(car) != 31)
+
+    guards.guarding._vehicle = SimpleNamespace(**vars(vehicle) | {"getSpeedWithoutTraCI": says})
+    drive(sumo, 25.0)
+    assert guards.guarding.limited > 0
+    assert guards.guarding.overruled == 0
 
 
 def test_a_car_that_sumo_teleports_begins_anew(tmp_path):

@@ -48,8 +48,8 @@ _SKIPPED = (
 )
 _OVERRULED = (
     "car {} drove otherwise than its guard, or its own driver, had it: a script (setSpeed, "
-    "slowDown) or a device of SUMO set its speed. It is left to that until it drives faster, "
-    "unguarded, and so is every such car"
+    "slowDown) or a device of SUMO set its speed. It is left to that, unguarded: a slower one "
+    "until it drives faster, a faster one while that shows. So is every such car"
 )
 # Speeds that differ by more are not the same [m/s].
 _DIFFERS = 1e-3
@@ -366,10 +366,12 @@ class Guarding:
 
     def _is_overruled(self, car: _Car, speed: float) -> bool:
         """Whether a script set its speed, which SUMO would forget; then it is left to it."""
-        limit = math.inf if car.mode is None else car.limit
+        wish = self._vehicle.getSpeedWithoutTraCI(car.id)
+        # Under a limit some models (EIDM) drive a little slower than they say.
+        limit, slack = (wish, 0.0) if car.mode is None else (car.limit, _COARSE * self._seeing.dt)
         if speed > limit + _DIFFERS:
-            car.script = math.inf
-        elif speed < min(limit, self._vehicle.getSpeedWithoutTraCI(car.id)) - _DIFFERS:
+            car.script = -math.inf
+        elif speed < min(limit, wish) - max(slack, _DIFFERS):
             if self._vehicle.isStopped(car.id):  # at its stop
                 return False
             car.script = speed
@@ -754,8 +756,8 @@ def attach(
     Where a guard acts, the speed mode has "safe speed" and the limit of acceleration on and that of
     braking off. It is put back as it was, with ``setSpeed(-1)``, as soon as the guard allows all
     that the car can do. A car that is seen to drive at another speed than its guard, or its own
-    driver, had set (a script's) is left alone until it drives faster. Where you set a car's speed
-    yourself, ask a `Guard` before you do instead.
+    driver, had set (a script's) is left alone: a slower one until it drives faster, a faster one
+    while that shows. Where you set a car's speed yourself, ask a `Guard` before you do instead.
     After ``load``, or ``close`` and ``start``, an attachment goes on with the new cars, and what it
     counts goes on; whoever attaches anew ends those of earlier simulations.
 
