@@ -1,4 +1,4 @@
-"""A SUMO script of one's own, with two lines more: the import and the one after ``start``."""
+"""A SUMO script of one's own, with three lines more: of evofsm, and of ``guards``."""
 
 import libsumo
 
@@ -9,4 +9,5 @@ guards = attach(libsumo, "type:hasty")
 while libsumo.simulation.getTime() < 400.0:
     libsumo.simulationStep()
 print(f"{len(guards.collisions)} collisions")
+guards.detach()
 libsumo.close()

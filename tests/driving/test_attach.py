@@ -2,6 +2,7 @@
 
 import importlib
 import xml.etree.ElementTree as ElementTree
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -277,10 +278,33 @@ def test_guards_go_on_wherever_time_moves_otherwise(road, tmp_path, begin):
             options += ["--begin", str(begin)]
         sumo.load(options)
     before, now = guards.guarding.decisions, sumo.simulation.getTime()
-    drive(sumo, 40.0, brakes_at=now + 15.0)
+    is_new = pytest.warns(RuntimeWarning, match="another simulation")
+    with nullcontext() if begin == "state" else is_new:
+        drive(sumo, 40.0, brakes_at=now + 15.0)
     assert guards.collisions == []
     assert guards.guarding.decisions > before + 100
     assert max(abs(one.deed) for one in told) < 9.1  # no step is taken for another
+
+
+def test_who_detaches_after_the_end_is_rid_of_the_guards(road):
+    guards = attach(sumo := road(*NO_GAP), ["ego"])
+    drive(sumo, 1.0)
+    sumo.close()
+    with pytest.raises(ValueError, match="no simulation of SUMO runs"):
+        attach(sumo, ["ego"])
+    guards.detach()
+    assert guards.cars == []
+    drive(road(*NO_GAP), 1.0)
+    assert guards.guarding.decisions == 10
+
+
+def test_where_sumo_looks_for_no_collisions_none_is_counted(road):
+    sumo = road(*NO_GAP)
+    sumo.load(["none" if option == "warn" else option for option in road.options])
+    with pytest.warns(RuntimeWarning, match="looks for no collisions"):
+        watch = attach(sumo, ["ego"], mode="watch")
+    drive(sumo, 25.0)
+    assert np.isnan(watch.summary()["collisions"])
 
 
 def test_who_skips_steps_is_told_that_nobody_looked(road):
@@ -436,7 +460,7 @@ def chosen(vehicles):
 
 def test_all_some_those_of_a_type_or_a_share_which_is_the_same_in_every_run():
     assert chosen("all") == chosen(1) == set(IDS)
-    assert chosen(["1", "2", "gone"]) == {"1", "2"}
+    assert chosen(["1", "2", "gone"]) == chosen(np.array(["1", "2"])) == {"1", "2"}
     assert chosen("type:bus") == {"7", "8"}
     assert chosen("type:bu") == set()
     assert chosen(0.1) == chosen("10%")

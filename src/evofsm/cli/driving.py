@@ -370,12 +370,17 @@ def _share(what: str) -> Callable[[Mapping[str, Any]], str]:
     return lambda came: f"{came[what] / came['decisions']:.1%}" if "decisions" in came else ""
 
 
+def _number(what: str) -> Callable[[Mapping[str, Any]], str]:
+    """How many; empty where they were not counted."""
+    return lambda came: "" if math.isnan(came[what]) else f"{came[what]:,}"
+
+
 # What is told of a simulation, by what it is called.
 _TOLD: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
     "cars chosen": lambda came: f"{came['cars']:,}",
-    "collisions": lambda came: f"{came['collisions']:,}",
-    "  by chosen cars": lambda came: f"{came['of_guarded']:,}",
-    "  into chosen cars": lambda came: f"{came['into_guarded']:,}",
+    "collisions": _number("collisions"),
+    "  by chosen cars": _number("of_guarded"),
+    "  into chosen cars": _number("into_guarded"),
     "hard brakes": lambda came: f"{came['hard_brakes']:,}",
     "mean speed [m/s]": lambda came: f"{came['speed']:.2f}",
     "time lost [s]": lambda came: f"{came['time_lost']:,.0f}",
@@ -399,6 +404,8 @@ def trace_configuration(
     with _running(file, "--fcd-output", str(out)) as (sumo, steps):
         start, n_positions, is_cut = float(sumo.simulation.getTime()), 0, False
         now, dt = start, float(sumo.simulation.getDeltaT())
+        if str(sumo.simulation.getOption("collision.action")) == "none":
+            warn(f"{file}: with --collision.action none SUMO looks for no collisions")
         for now in steps:
             for crash in sumo.simulation.getCollisions():
                 # A step is written with the time at which it began.

@@ -57,6 +57,14 @@ _MESOSCOPIC = (
     "this is SUMO's mesoscopic simulation (--mesosim), in which no car has a leader, so that a "
     "guard would see nobody. Attach to a microscopic one, without --mesosim"
 )
+_UNCOUNTED = (
+    "with --collision.action none SUMO looks for no collisions, so that none can be counted; "
+    "choose another, such as warn"
+)
+_ANOTHER = (
+    "another simulation has begun, and what was attached to the one before goes on in it, guards "
+    "as well as counts; where it is to end, call detach() before close()"
+)
 _NUMBERS = count()
 _ATTACHED: weakref.WeakSet[Attachment] = weakref.WeakSet()
 # Two that touched within this time before still do [s].
@@ -99,6 +107,10 @@ class Seeing:
     def __init__(self, sumo: Any) -> None:
         self._vehicle, self._simulation = sumo.vehicle, sumo.simulation
         self._bodies: dict[str, _Facts] = {}
+        try:
+            sumo.simulation.getTime()
+        except _no_simulation(sumo) as error:
+            raise ValueError("no simulation of SUMO runs; start one, then attach") from error
         self.look_up()
 
     def look_up(self) -> None:
@@ -106,6 +118,10 @@ class Seeing:
         simulation = self._simulation
         if str(simulation.getOption("mesosim")).lower() in ("true", "1"):
             raise ValueError(_MESOSCOPIC)
+        #: Whether SUMO looks for collisions.
+        self.counts = str(simulation.getOption("collision.action")) != "none"
+        if not self.counts:
+            warnings.warn(_UNCOUNTED, RuntimeWarning, stacklevel=5)
         factor = float(simulation.getOption("collision.mingap-factor"))
         # Share of minGap that SUMO wants kept; below 0 each model has its own, at most all of it.
         self._factor = factor if factor >= 0.0 else 1.0
@@ -227,6 +243,12 @@ class _Car:
     about: tuple[str, Role | None] = ("", None)
 
 
+def _no_simulation(sumo: Any) -> type[Exception]:
+    """What is raised where none runs; a connection of traci does not have it."""
+    module = sumo if hasattr(sumo, "FatalTraCIError") else import_module("traci")
+    return module.FatalTraCIError  # type: ignore[no-any-return]
+
+
 def _further(speed: float, decel: float, euler: float) -> float:
     """So much further a car gets until it stands [m], as that is amid an Euler step [s]."""
     if not euler:
@@ -307,9 +329,9 @@ class Guarding:
                     speeds[car.around[0].id] = car.around[0].speed
                 if car.seen is not None and self._acts:
                     self._decide(car, car.high)
-            car.speed, car.time = speed, time
             if self._acts:
                 self._act(car, speed)
+            car.speed, car.time = speed, time
         if decides:
             self._watch(speeds)
 
@@ -473,7 +495,7 @@ def _judge(guard: Guard) -> ActionJudge | None:
 
 def choose(vehicles: str | float | Iterable[str]) -> Callable[[Any, str], bool]:
     """A test of whether a vehicle is one of those that are meant, the same in every run."""
-    if vehicles == "all":
+    if isinstance(vehicles, str) and vehicles == "all":
         return lambda sumo, car: True
     if isinstance(vehicles, str) and vehicles.startswith(_TYPE):
         kind = vehicles.removeprefix(_TYPE)
@@ -597,26 +619,31 @@ class Attachment:
             # twice, once by what was attached to the one before.
             for stale in [a for a in _ATTACHED if a._sumo is self._sumo and a._is_new()]:
                 stale._listen_no_more()
-        listener = type("Listener", (base,), {"step": lambda *_: self.step()})()
+        does = {"step": lambda *_: self.step(), "cleanUp": lambda *_: self._is_removed()}
+        listener = type("Listener", (base,), does)()
         self._listener = self._sumo.addStepListener(listener)
         self._sumo.simulation.setParameter("", self._key, "1")
         _ATTACHED.add(self)
 
     def detach(self) -> None:
-        """Hand every car back to SUMO, and listen no longer."""
+        """Hand every car back to SUMO, if it still runs, and listen no longer."""
         self._listen_no_more()
         self._hand_back()
 
     def _hand_back(self) -> None:
-        for car in set(self._sumo.vehicle.getIDList() if self.cars else ()).intersection(self.cars):
-            self._cars.remove(car)
+        if self.cars and not self._is_new():
+            for car in set(self._sumo.vehicle.getIDList()).intersection(self.cars):
+                self._cars.remove(car)
         self._cars.cars.clear()
 
     def _listen_no_more(self) -> None:
         if self._listener is not None:
             self._sumo.removeStepListener(self._listener)
-            self._listener = None
-            _ATTACHED.discard(self)
+
+    def _is_removed(self) -> None:
+        """It listens no longer; traci removes whoever listens where it closes."""
+        self._listener = None
+        _ATTACHED.discard(self)
 
     def step(self) -> bool:
         """Take in a step of the simulation that is over, and decide on the next.
@@ -627,6 +654,7 @@ class Attachment:
         begin = clock.perf_counter()
         now, before = float(self._sumo.simulation.getTime()), self._now
         if self._is_new():
+            warnings.warn(_ANOTHER, RuntimeWarning, stacklevel=2)
             self._begin_anew()
             self._sumo.simulation.setParameter("", self._key, "1")
         elif before is not None and abs(now - before - self._seeing.dt) > _TICK:
@@ -671,13 +699,19 @@ class Attachment:
             "jerk": math.sqrt(ride.jerks / seconds),
             "time_lost": ride.lost,
         }
+        if not self._seeing.counts:
+            numbers |= dict.fromkeys(("collisions", "of_guarded", "into_guarded"), math.nan)
         if guards is not None and guards.decisions:
             numbers |= {name: getattr(guards, name) for name in ("decisions", "limited", "revised")}
             numbers["microseconds"] = 1e6 * self.seconds / guards.decisions
         return numbers
 
     def _is_new(self) -> bool:
-        return bool(self._sumo.simulation.getParameter("", self._key) != "1")
+        """Whether another simulation runs than it was attached to, or none."""
+        try:
+            return bool(self._sumo.simulation.getParameter("", self._key) != "1")
+        except _no_simulation(self._sumo):
+            return True
 
     def _begin_anew(self) -> None:
         """Forget the cars, which are other ones, or are elsewhere; who is here is handed back."""
@@ -748,8 +782,8 @@ def attach(
     Raises
     ------
     ValueError
-        If there is no such mode or choice of vehicles, the simulation is mesoscopic, or the guard
-        decides at other times than those of steps, or observes something else.
+        If there is no such mode or choice of vehicles, no simulation runs, or a mesoscopic one, or
+        the guard decides at other times than those of steps, or observes something else.
 
     Notes
     -----
@@ -758,8 +792,9 @@ def attach(
     that the car can do. A car that is seen to drive at another speed than its guard, or its own
     driver, had set (a script's) is left alone: a slower one until it drives faster, a faster one
     while that shows. Where you set a car's speed yourself, ask a `Guard` before you do instead.
-    After ``load``, or ``close`` and ``start``, an attachment goes on with the new cars, and what it
-    counts goes on; whoever attaches anew ends those of earlier simulations.
+    After ``load``, or ``close`` and ``start`` of libsumo, an attachment goes on with the new cars,
+    and what it counts goes on, as a warning says; ``detach`` ends it, and so does whoever attaches
+    anew. With ``--collision.action none`` SUMO looks for no collisions, and their numbers are NaN.
 
     Examples
     --------
