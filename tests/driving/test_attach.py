@@ -348,6 +348,34 @@ def test_a_model_that_under_a_limit_drives_a_little_slower_than_it_says_is_no_sc
     assert guards.guarding.overruled == 0
 
 
+def test_what_a_car_can_do_is_asked_anew_as_on_a_wet_road(road):
+    guards = attach(sumo := road(*NO_GAP), ["ego"])
+    drive(sumo, 5.0)
+    sumo.vehicle.setDecel("ego", 1.5)
+    sumo.vehicle.setEmergencyDecel("ego", 1.5)
+    for _ in range(20):
+        before = drive(sumo, 0.1)[-1]
+    speeds = np.array([before, *drive(sumo, 13.0, brakes_at=8.0)])
+    assert np.diff(speeds).min() >= -0.1501
+    assert guards.guarding.overruled == 0
+
+
+def test_whoever_is_of_the_type_now_is_guarded_and_who_is_not_is_not(road):
+    sumo = road(*NO_GAP, others=USUAL)
+    guards = attach(sumo, "type:hasty")
+    drive(sumo, 0.5)
+    sumo.vehicle.setType("ego", "usual")
+    sumo.vehicle.setType("lead", "hasty")
+    drive(sumo, 0.5)
+    assert guards.cars == ["lead"]
+    assert sumo.vehicle.getSpeedMode("ego") == 31
+    sumo.vehicle.remove("lead")
+    sumo.vehicle.add("lead", "along", "calm")  # another one of this name
+    drive(sumo, 0.5)
+    assert guards.cars == []
+    assert guards.ever == {"ego", "lead"}
+
+
 def test_a_car_that_sumo_teleports_begins_anew(tmp_path):
     cars = tmp_path / "cars.rou.xml"
     cars.write_text(

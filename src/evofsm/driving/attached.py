@@ -96,7 +96,9 @@ class Neighbour(NamedTuple):
 class _Facts(NamedTuple):
     length: float  #: [m]
     min_gap: float  #: [m]
+    accel: float  #: [m/s²]
     decel: float  #: [m/s²]
+    hardest: float  #: braking [m/s²]
     tau: float  #: [s]
     late: bool  #: whether it decides less often than in each step, and than its ``tau``
 
@@ -106,6 +108,8 @@ class Seeing:
 
     def __init__(self, sumo: Any) -> None:
         self._vehicle, self._simulation = sumo.vehicle, sumo.simulation
+        self._type = sumo.vehicletype
+        self._types: dict[str, str] = {}
         self._bodies: dict[str, _Facts] = {}
         try:
             sumo.simulation.getTime()
@@ -114,7 +118,7 @@ class Seeing:
         self.look_up()
 
     def look_up(self) -> None:
-        """Look up what holds in this simulation; no car of another one is known."""
+        """Look up what holds in this simulation."""
         simulation = self._simulation
         if str(simulation.getOption("mesosim")).lower() in ("true", "1"):
             raise ValueError(_MESOSCOPIC)
@@ -133,6 +137,11 @@ class Seeing:
         # slower one further; whoever comes to a standstill amid a step gets further, too, by up to
         # an eighth of its braking over the square of the step (`_further`).
         self._euler = 0.0 if ballistic else self.dt
+        self.look_again()
+
+    def look_again(self) -> None:
+        """Look at the cars anew: in another step a script may have changed them, or their types."""
+        self._types.clear()
         self._bodies.clear()
 
     def meet(self, car: str) -> None:
@@ -143,19 +152,17 @@ class Seeing:
         if self._vehicle.getActionStepLength(car) > self.dt + _TICK:
             self._euler = 0.0
 
-    def forget(self, car: str) -> None:
-        """It has left."""
-        self._bodies.pop(car, None)
-
     def body(self, car: str) -> _Facts:
-        """Of a car; that its type changes is not noticed."""
-        if car not in self._bodies:
-            vehicle = self._vehicle
-            tau = vehicle.getTau(car)
-            late = vehicle.getActionStepLength(car) > max(self.dt, tau) + _TICK
-            facts = vehicle.getLength(car), vehicle.getMinGap(car), vehicle.getDecel(car)
-            self._bodies[car] = _Facts(*facts, tau, late)
-        return self._bodies[car]
+        """Of a car, by its type; what a script changes of one car makes that a type of its own."""
+        kind = self._types.get(car) or self._types.setdefault(car, self._vehicle.getTypeID(car))
+        if kind not in self._bodies:
+            of = self._type
+            decel, tau = of.getDecel(kind), of.getTau(kind)
+            late = of.getActionStepLength(kind) > max(self.dt, tau) + _TICK
+            brakes = decel, max(of.getEmergencyDecel(kind), decel)
+            facts = of.getLength(kind), of.getMinGap(kind), of.getAccel(kind), *brakes, tau, late
+            self._bodies[kind] = _Facts(*facts)
+        return self._bodies[kind]
 
     def pair(self, car: str) -> tuple[float, float, float] | None:
         """Gap from bumper to bumper [m], its speed and that of whoever is ahead [m/s].
@@ -189,14 +196,14 @@ class Seeing:
 
     def wish(self, car: str, speed: float, ahead: Neighbour | None) -> float:
         """The speed that a car's own model wants after the next step [m/s], but for red lights."""
-        vehicle = self._vehicle
-        fastest = min(vehicle.getAllowedSpeed(car), speed + vehicle.getAccel(car) * self.dt)
+        vehicle, body = self._vehicle, self.body(car)
+        fastest = min(vehicle.getAllowedSpeed(car), speed + body.accel * self.dt)
         if ahead is None:
             return float(fastest)
-        gap = ahead.gap - self.body(car).min_gap  # as SUMO's models take it
+        gap = ahead.gap - body.min_gap  # as SUMO's models take it
         decel = vehicle.getApparentDecel(ahead.id)
         follow_speed = vehicle.getFollowSpeed(car, speed, gap, ahead.speed, decel, ahead.id)
-        slowest = speed - vehicle.getEmergencyDecel(car) * self.dt
+        slowest = speed - body.hardest * self.dt
         return float(max(min(follow_speed, fastest), slowest, 0.0))
 
     def rows(
@@ -231,6 +238,7 @@ class _Car:
     id: str
     guard: Guard
     high: float  # the hardest acceleration
+    body: _Facts  # that the guard counts on
     mode: int | None = None  # SUMO's speed mode before it was taken over
     speed: float = 0.0
     limit: float = 0.0  # the speed that was set
@@ -305,10 +313,7 @@ class Guarding:
 
     def add(self, car: str) -> None:
         """Guard it from now on."""
-        high = self._vehicle.getAccel(car)
-        guard = self._guard_for(car, high)
-        # What a guard cannot allow either way it does not forbid.
-        self.cars[car] = _Car(car, guard, min(high, guard.actions.high))
+        self.cars[car] = _Car(car, *self._guard_for(self._seeing.body(car)))
 
     def remove(self, car: str) -> None:
         """Guard it no longer: it is handed back."""
@@ -337,6 +342,9 @@ class Guarding:
 
     def _look(self, car: _Car, speed: float) -> None:
         """See what is around; without anybody, a guard of one leader has nothing to decide on."""
+        if (body := self._seeing.body(car.id)) != car.body:  # as on a wet road
+            car.guard, car.high, car.body = self._guard_for(body)
+            car.around = None, None
         ahead, before = self._seeing.neighbour(car.id, speed), car.around[0]
         scene = isinstance(judge := _judge(car.guard), TrafficRisk)
         # Who is behind matters only where one brakes: if acting, because somebody is ahead.
@@ -470,15 +478,17 @@ class Guarding:
             self.leaders[decel] = Manoeuvres(decel, width=_SEEN_TO)
         return self.leaders[decel]
 
-    def _guard_for(self, car: str, high: float) -> Guard:
+    def _guard_for(self, body: _Facts) -> tuple[Guard, float, _Facts]:
         if self._template is None:
-            decel, vehicle = self._vehicle.getDecel(car), self._vehicle
-            return self._given(decel, max(vehicle.getEmergencyDecel(car), decel), high)
-        guard = self._template.copy()
-        guard.freeze()
-        if isinstance(guard.reviser, ActionReviser):
-            guard.reviser.mode = self._mode
-        return guard
+            guard = self._given(body.decel, body.hardest, body.accel)
+        else:
+            guard = self._template.copy()
+            guard.freeze()
+            if isinstance(guard.reviser, ActionReviser):
+                guard.reviser.mode = self._mode
+        high: Any = guard.actions.high
+        # What a guard cannot allow either way it does not forbid.
+        return guard, min(body.accel, high), body
 
     def _given(self, decel: float, hardest: float, high: float) -> Guard:
         """A guard that counts on one braking, of leaders too, and brakes harder if it has to."""
@@ -591,8 +601,10 @@ class Attachment:
         chosen: Callable[[Any, str], bool],
         seeing: Seeing,
         cars: Guarding | Watching,
+        asks_again: bool = False,
     ) -> None:
         self._sumo, self._chosen, self._seeing, self._cars = sumo, chosen, seeing, cars
+        self._asks_again = asks_again  # of cars that are known, as their types may change
         self.guarding = cars if isinstance(cars, Guarding) else None
         self.watching = cars if isinstance(cars, Watching) else None
         self._now: float | None = None
@@ -662,6 +674,7 @@ class Attachment:
                 warnings.warn(_SKIPPED, RuntimeWarning, stacklevel=2)
             self._begin_anew()
         self._now = now
+        self._seeing.look_again()
         self._count_cars()
         for collision in self._sumo.simulation.getCollisions():
             pair = collision.collider, collision.victim
@@ -729,16 +742,22 @@ class Attachment:
         jumps = here & set(simulation.getStartingTeleportIDList())
         for car in jumps.intersection(self._cars.cars):
             self._cars.remove(car)
+        # Who departs with the name of one that was here a step ago is another car.
+        before = self._known - jumps - set(simulation.getDepartedIDList())
         if jumps:  # who does not end it at once is on its way
             here -= jumps.difference(simulation.getEndingTeleportIDList())
-        for car in self._known - here | jumps:
+        for car in self._known - (before & here):
             self._cars.cars.pop(car, None)
-            self._seeing.forget(car)
-        for car in sorted(here - (self._known - jumps)):
+            self._ride.latest.pop(car, None)
+        for car in here - before:
             self._seeing.meet(car)
-            if self._chosen(self._sumo, car):
-                self._cars.add(car)
-                self.ever.add(car)
+        candidates = here if self._asks_again else here - before
+        picks = {car for car in candidates if self._chosen(self._sumo, car)}
+        for car in candidates.intersection(self._cars.cars) - picks:
+            self._cars.remove(car)
+        for car in sorted(picks.difference(self._cars.cars)):
+            self._cars.add(car)
+            self.ever.add(car)
         self._known = here
 
 
@@ -763,7 +782,8 @@ def attach(
     sumo : module or connection
         libsumo, or traci, with a simulation started.
     vehicles : str, float or iterable of str
-        ``"all"``, ``"type:NAME"``, a share such as 0.1 or ``"10%"``, or ids; those to come as well.
+        ``"all"``, ``"type:NAME"``, a share such as 0.1 or ``"10%"``, or ids; those to come as well,
+        and whoever changes to that type.
     guard : Guard, optional
         Each car gets a copy, frozen. It observes scenes (`guard_for_traffic`) or gap and speeds
         (`guard_for_cars`, or `Guard.of` an `EnvelopeReviser`). Without one, each counts on SUMO's
@@ -815,6 +835,7 @@ def attach(
     cars: Guarding | Watching = Watching(sight)
     if mode != "watch":
         cars = Guarding(sumo, sight, guard, mode == "act", tolerance, regain, report)
-    attachment = Attachment(sumo, is_chosen, sight, cars)
+    by_type = isinstance(vehicles, str) and vehicles.startswith(_TYPE)
+    attachment = Attachment(sumo, is_chosen, sight, cars, by_type)
     attachment.listen()
     return attachment
