@@ -122,6 +122,7 @@ def test_who_only_looks_changes_nothing(road, mode):
         pytest.param(0.1, (), marks=pytest.mark.slow),
         (0.5, ("--default.action-step-length", "1")),
         (1.0, ()),
+        (1.0, ("--step-method.ballistic", "true")),
     ],
 )
 def test_where_drivers_keep_their_distance_guards_do_no_harm(road, step, options):

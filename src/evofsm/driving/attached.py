@@ -136,7 +136,7 @@ class Seeing:
         # rehearsed, a faster follower gets less far by half a step's worth of the difference, and a
         # slower one further; whoever comes to a standstill amid a step gets further, too, by up to
         # an eighth of its braking over the square of the step (`_further`).
-        self._euler = 0.0 if ballistic else self.dt
+        self.euler = 0.0 if ballistic else self.dt
         self.look_again()
 
     def look_again(self) -> None:
@@ -150,7 +150,7 @@ class Seeing:
         Cars are asked, no types: one may be a distribution, of which SUMO would draw.
         """
         if self._vehicle.getActionStepLength(car) > self.dt + _TICK:
-            self._euler = 0.0
+            self.euler = 0.0
 
     def body(self, car: str) -> _Facts:
         """Of a car, by its type; what a script changes of one car makes that a type of its own."""
@@ -182,7 +182,7 @@ class Seeing:
         neighbour, gap = find(car, reach) or ("", 0.0)
         if not neighbour:
             return None
-        v, euler = self._vehicle.getSpeed(neighbour), self._euler
+        v, euler = self._vehicle.getSpeed(neighbour), self.euler
         cars, speeds = (car, neighbour), (speed, v)
         follower, leader = map(self.body, cars if is_ahead else cars[::-1])
         v_follower, v_leader = speeds if is_ahead else speeds[::-1]
@@ -191,7 +191,8 @@ class Seeing:
         spare_gap = (1.0 - self._factor) * follower.min_gap if gap else 0.0
         room = gap + spare_gap + 0.5 * euler * (v_follower - v_leader)
         late = 0.125 * follower.decel * euler * euler  # at most, whatever the follower does
-        most = 0.0 if late < _MARGIN else room + _further(v_leader, leader.decel, euler)
+        coarse = 0.125 * follower.decel * self.dt * self.dt >= _MARGIN
+        most = room + _further(v_leader, leader.decel, euler) if coarse else 0.0
         return Neighbour(neighbour, gap + follower.min_gap, max(room - late, _NEAREST), v, most)
 
     def wish(self, car: str, speed: float, ahead: Neighbour | None) -> float:
@@ -423,7 +424,7 @@ class Guarding:
         body = self._seeing.body(car.id)
         if not (isinstance(judge, TrafficRisk) and ahead and ahead.most and body.tau >= dt):
             return False
-        room = max(ahead.most - _further(car.wish, body.decel, dt), _NEAREST)
+        room = max(ahead.most - _further(car.wish, body.decel, self._seeing.euler), _NEAREST)
         # It may use up the margin, as SUMO's models do.
         here = room + judge.ahead.margin, speed, ahead.speed
         critical = judge.ahead.critical(here, [(car.wish - speed) / dt])
