@@ -784,7 +784,7 @@ def attach(
         libsumo, or traci, with a simulation started.
     vehicles : str, float or iterable of str
         ``"all"``, ``"type:NAME"``, a share such as 0.1 or ``"10%"``, or ids; those to come as well,
-        and whoever changes to that type.
+        and whoever changes to that type. The name of a vTypeDistribution is no type.
     guard : Guard, optional
         Each car gets a copy, frozen. It observes scenes (`guard_for_traffic`) or gap and speeds
         (`guard_for_cars`, or `Guard.of` an `EnvelopeReviser`). Without one, each counts on SUMO's
