@@ -151,6 +151,11 @@ LOOKED_AT = {
     "Date,Time": (lambda k: f"{at(k):%d/%m/%Y,%H:%M}", "--time Date,Time"),
     "Zeit": (lambda k: f"{at(k):%Y-%m-%d %H:%M:%S}@5", "the clock Zeit"),
     "time": (lambda k: 600 - k, "time runs backwards"),
+    "__time": (lambda k: k, "--time __time "),
+    "time_zone,SimTime": (lambda k: f"1,{k}", "--time SimTime "),
+    "read on,Elapsed (s)": (lambda k: f"2025-03-10 06:00:00,{k}", "--time 'Elapsed (s)' "),
+    "read on,seconds": (lambda k: f"3/10/2025 6:00:00,{k}", "--time seconds "),
+    "_start,at": (lambda k: f"{at(0):%Y-%m-%d %H:%M},{at(k):%Y-%m-%d %H:%M:%S}", "--time at "),
     "t": (lambda k: k + 7200 * (k > 500) + 60 * (k > 550), "rows looked at 600, one every 1 s"),
 }
 
@@ -179,6 +184,16 @@ def test_a_row_of_each_signal_becomes_a_column_as_it_is_advised(evofsm):
     command, again = evofsm("learn", "tags.csv").stdout.splitlines()[-2:]
     shell(command.strip())
     assert "--observe level,flow" in evofsm(*again.split()[1:]).stdout
+
+
+def test_signals_of_two_clocks_are_held_as_it_is_proposed(evofsm):
+    rows = (f"{k / 10:.1f},,{k % 17}\n{k / 10 + 0.03:.2f},{k % 17}," for k in range(600))
+    Path("log.csv").write_text("\n".join(["stamps,heat,oil", *rows]))
+    command = evofsm("learn", "log.csv").stdout.replace("\\\n", "").rpartition("  evofsm ")[2]
+    assert "--time stamps --hold 0.5 --rule" in " ".join(command.split())
+    learnt = json.loads(evofsm(*shlex.split(command), "--json").stdout)
+    assert learnt["rows"] >= 599
+    assert learnt["seconds"] == pytest.approx(0.1 * (learnt["rows"] - 1))
 
 
 def test_a_first_look_names_the_cause(evofsm):

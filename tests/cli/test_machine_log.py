@@ -190,27 +190,6 @@ def test_a_first_look_says_what_is_odd_in_a_log(evofsm, refused):
     assert "say what is observed in odd.csv" in unsaid.stderr
 
 
-@pytest.mark.parametrize(
-    ("header", "row", "clock"),
-    [
-        ("__time,heat", "{0:.1f},{1}", "__time"),
-        ("time_zone,SimTime,heat", "1,{0:.1f},{1}", "SimTime"),
-        ("read on,Elapsed (s),heat", "2025-03-10 06:00:00,{0:.1f},{1}", "'Elapsed (s)'"),
-        ("read on,seconds,heat", "3/10/2025 6:00:00,{0:.1f},{1}", "seconds"),
-        ("_start,at,y,of", "2025-03-10 06:00,2025-03-10 06:00:{0:04.1f},{1},gap", "at"),
-        ("stamps,heat,oil", "{0:.1f},,{1}\n{2:.2f},{1},", "stamps --hold 0.5"),  # of two clocks
-    ],
-)
-def test_a_clock_is_found_by_its_name_where_it_runs(evofsm, header, row, clock):
-    rows = (row.format(k / 10, k % 17, k / 10 + 0.03) for k in range(600))
-    Path("log.csv").write_text("\n".join([header, *rows, ""]))
-    command = evofsm("learn", "log.csv").stdout.partition("  evofsm ")[2].replace("\\\n", "")
-    assert f"--time {clock} --rule" in " ".join(command.split())
-    learnt = json.loads(evofsm(*shlex.split(command), "--json").stdout)
-    assert learnt["rows"] >= 599
-    assert learnt["seconds"] == pytest.approx(0.1 * (learnt["rows"] - 1))
-
-
 def test_a_later_file_is_read_by_its_own_header_or_refused_with_what_differs(evofsm, refused):
     def write(name, header="t,heat,u\n", row="{t},{heat}.5,{u}\n", step=1):
         rows = (row.format(t=step * k, heat=k % 50, u=k % 3) for k in range(200))
