@@ -66,17 +66,15 @@ def told(client, kind):
 
 def test_the_page_and_all_that_it_needs_are_served_under_its_address(page):
     folder = urlsplit(page.address).path
-    status, headers, body = get(page, folder)
-    assert status == 200
-    assert b"<!doctype html>" in body
+    for query in ("", "?from=here"):
+        status, headers, body = get(page, folder + query)
+        assert (status, b"<!doctype html>" in body) == (200, True)
+        status, moved, _ = get(page, folder.rstrip("/") + query)
+        assert (status, moved["Location"]) == (308, f"{page.token}/")
     assert body.count(b'data-status="unjudged"') == body.count(b"<noscript>") == 1
     assert "default-src 'none'" in headers["Content-Security-Policy"]
     assert b"http:" not in body
     assert b"https:" not in body
-    for query in ("", "?from=here"):
-        assert get(page, folder + query)[0] == 200
-        status, headers, _ = get(page, folder.rstrip("/") + query)
-        assert (status, headers["Location"]) == (308, f"{page.token}/")
     for name in page._files:
         status, headers, body = get(page, folder + name)
         assert status == 200
@@ -173,9 +171,9 @@ def test_pages_act_on_the_run(page):
         assert told(client, "start")["case"] == 3
 
 
-def test_a_page_is_served_while_what_is_watched_hangs(page, monkeypatch):
-    goes, step = threading.Event(), page.player._watched.step
-    monkeypatch.setattr(page.player._watched, "step", lambda: goes.wait(60) and step())
+def test_a_page_is_served_while_what_is_watched_hangs_or_broke_off(page, monkeypatch):
+    goes, why = threading.Event(), "ZeroDivisionError: division by zero"
+    monkeypatch.setattr(page.player._watched, "step", lambda: goes.wait(60) and 1 / 0)
     with looking_on(page) as first:
         first.send('{"do": "step"}')
         assert get(page, f"/{page.token}/")[0] == 200
@@ -183,7 +181,13 @@ def test_a_page_is_served_while_what_is_watched_hangs(page, monkeypatch):
             assert told(later, "start")["case"] == 0
         assert not page._frames
         goes.set()
+        while not told(first, "clock")["over"]:
+            pass
+        assert told(first, "failed")["text"] == page.player.fault == why
+        monkeypatch.undo()
+        first.send('{"do": "restart"}')
         assert told(first, "frame")["number"] == 0
+        assert page.player.fault == ""
 
 
 def test_a_run_waits_for_the_first_who_looks_on(shown):

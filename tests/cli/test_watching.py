@@ -1,14 +1,12 @@
 """A run that is watched: what is shown of it, its story, and the clock it is played by."""
 
 import math
-import sys
 import time
 from functools import cache
 
 import pytest
 
 from evofsm.cli.options import reading_of
-from evofsm.cli.watch.server import Player
 from evofsm.cli.watch.session import OnRoads, Session, learn_first, read_simulated, watched_log
 from evofsm.cli.watch.words import introduce, tell
 from evofsm.driving import KinematicWorld, load_family, teach
@@ -229,44 +227,12 @@ def test_episodes_of_a_log_end_with_a_contact_and_it_opens_on_one(tmp_path):
     assert (fourth.case, fourth.begins) == (3, pytest.approx(10.0))  # of 50 s the last 40 s
 
 
-def test_what_was_before_is_shown_at_once():
-    session, told = opened(), []
+def test_what_was_before_is_shown_at_once(shown):
+    session = opened()
     session.start = session.start._replace(begins=2.0)
-    end = time.monotonic() + 1.0
-
-    def hear(kind, what):
-        told.append(kind)
-        if time.monotonic() > end:
-            sys.exit()
-
-    player = Player(session, hear)
-    player.set(awaits=False, speed=0.25)
-    with pytest.raises(SystemExit):
-        player.play()
-    assert 8 <= told.count("frame") <= 12  # one every 0.25 s of the run, then one a second
-
-
-def test_a_run_that_breaks_off_says_why_and_can_be_begun_anew(capsys):
-    session, told = opened(), []
-
-    def hear(kind, what):
-        told.append((kind, what))
-        if kind == "failed":
-            sys.exit()
-
-    player = Player(session, hear)
-    player.set(awaits=False, speed=math.inf)
-    session.step, step = lambda: 1 / 0, session.step
-    with pytest.raises(SystemExit):
-        player.play()
-    why = "ZeroDivisionError: division by zero"
-    assert (told[-1], told[-2][1].over, player.fault) == (("failed", why), True, why)
-    assert capsys.readouterr().err == f"evofsm: the run broke off: {why}\n"
-    session.step = lambda: sys.exit(step().number)
-    player.restart()
-    with pytest.raises(SystemExit, match="0"):
-        player.play()
-    assert player.fault == ""
+    with shown(lambda: session, speed=0.25) as page:
+        time.sleep(1.0)
+    assert 8 <= len(page._frames) <= 12  # one every 0.25 s of the run, then one a second
 
 
 # -- A judge that was told nothing but which episodes failed --------------------------------------
