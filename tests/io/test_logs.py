@@ -211,15 +211,9 @@ def test_episodes_that_come_back_are_refused_with_the_remedy(tmp_path, pieces):
         (b"\xfd7zXZ\0" + bytes(50), "compressed by xz; unpack it"),
         (b"PK\3\4" + bytes(50), "an Excel workbook"),
         (b'[\n  {"time": 0}]', "is JSON"),
-        (
-            HEADER.encode("utf-16-le"),
-            "not text in UTF-8 (an archive, binary data, or text in UTF-16",
-        ),
+        (HEADER.encode("utf-16-le"), "UTF-8 (an archive, binary data, or text in UTF-16"),
         (b"version https://git-lfs.github.com/spec/v1\n", "is a pointer of Git LFS"),
-        (
-            gzip.compress(b"PAR1" + bytes(50), mtime=0),
-            "is gzipped, and cannot be read so; unpack it",
-        ),
+        (gzip.compress(b"PAR1" * 9, mtime=0), "is gzipped, and cannot be read so; unpack it"),
         (f"{HEADER}\nr,a,0,0,1,1,1,1\nr,\0é".encode("latin1"), "after line 2: this is not text"),
         (f"{HEADER.replace('segment', 'gap')}\n1,2".encode(), "two columns are called 'gap'"),
         (f'{HEADER}\nr,"v1,0,1\n{"x" * 90}'.encode(), "unclosed quote"),
@@ -448,13 +442,9 @@ def joined(rows=40):
             yield f"p,{k / 10 + 0.06:.2f},,,{11 + k},,"
 
 
+@pytest.mark.parametrize("pieces", [1 << 11, 1 << 20], indirect=True)
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
-@pytest.mark.parametrize("at_once", [1 << 11, 1 << 20])
-def test_signals_of_several_clocks_are_held_at_the_times_of_actions(
-    tmp_path, monkeypatch, ending, at_once
-):
-    monkeypatch.setattr(tables, "_CSV_BYTES", at_once)
-    monkeypatch.setattr(tables, "_PARQUET_ROWS", at_once)
+def test_signals_of_several_clocks_are_held_at_the_times_of_actions(tmp_path, pieces, ending):
     path, noted = write(tmp_path / "a.csv", joined(), SHORT), Noted()
     if ending == "parquet":
         polars.read_csv(path).write_parquet(tmp_path / "a.parquet")
@@ -474,13 +464,12 @@ def test_signals_of_several_clocks_are_held_at_the_times_of_actions(
     assert [21, 10, 30] not in seen.tolist()  # of 0.17 s before
 
 
-@pytest.mark.parametrize("at_once", [1 << 8, 1 << 20])
+@pytest.mark.parametrize("pieces", [1 << 8, 1 << 20], indirect=True)
 @pytest.mark.parametrize("tell", ["p,9,0,,,,", "p,9,,,,,1"])
 @pytest.mark.parametrize("follows", [[], ["p,9.03,,10,,1,"], ["p,9.01,5,,,,0", "p,9.03,,10,,1,"]])
 def test_a_failure_that_a_row_without_an_action_tells_is_that_of_the_next_or_the_last_row(
-    tmp_path, monkeypatch, at_once, tell, follows
+    tmp_path, pieces, tell, follows
 ):
-    monkeypatch.setattr(tables, "_CSV_BYTES", at_once)
     run = [f"p,{8.9 - k / 10:.2f},,10,11,1,0\np,{8.95 - k / 10:.2f},9,,,," for k in range(12)][::-1]
     again = [f"q,{k / 10},,10,11,1,0\nq,{k / 10 + 0.05},8,,,," for k in range(5)]
     path = write(tmp_path / "a.csv", [*run, tell, *follows, *again], SHORT)

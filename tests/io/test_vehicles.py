@@ -38,14 +38,14 @@ def episodes(path, **columns):
 FIELDS = ("id", "lane", "pos", "speed", "type")
 
 
-def xml(timesteps):
-    """FCD from ``{time: [(id, lane, pos, speed[, type]), ...]}``, or dicts; a row each."""
+def xml(timesteps, fields=FIELDS):
+    """FCD from ``{time: [(id, lane, pos, speed[, type]), ...]}``, or other fields; a row each."""
     lines = ["<fcd-export>"]
     for time, present in timesteps.items():
         lines.append(f'<timestep time="{time}">')
         for one in present:
-            told = one if isinstance(one, dict) else dict(zip(FIELDS, one, strict=False))
-            seen = " ".join(f'{name}="{value}"' for name, value in told.items())
+            told = zip(fields, one, strict=False)
+            seen = " ".join(f'{name}="{value}"' for name, value in told)
             lines.append(f"<vehicle {seen}/>")
         lines.append("</timestep>")
     return "\n".join([*lines, "</fcd-export>", ""])
@@ -189,12 +189,12 @@ def test_who_is_beside_is_nobody_s_leader_in_fcd(tmp_path, told, ending):
             x, y = 13.0 + x / 111_195.0 / math.cos(math.radians(52.0)), 52.0 + y / 111_195.0
         places = {"posLat": across, "x": x, "y": y, "angle": 30.0, "geo": 1}
         kind = "truck" if name == "truck" else "bike"
-        seen.append(dict(zip(FIELDS, (name, "e", along, 5.0, kind), strict=True)))
-        seen[-1] |= {place: places[place] for place in told}
-    text = xml({0.0: seen, 0.1: seen})
+        seen.append((name, "e", along, 5.0, kind, *(places[place] for place in told)))
+    fields = *FIELDS, *told
+    text = xml({0.0: seen, 0.1: seen}, fields)
     if ending == "csv":
-        rows = [["timestep_time", *(f"vehicle_{name}" for name in seen[0])]]
-        rows += [[time, *one.values()] for time in (0.0, 0.1) for one in seen]
+        rows = [["timestep_time", *(f"vehicle_{name}" for name in fields)]]
+        rows += [[time, *one] for time in (0.0, 0.1) for one in seen]
         text = "\n".join(",".join(map(str, row)) for row in rows)
     path, noted = write(tmp_path / f"a.{ending}", text), Noted()
     lengths = lengths_given(["bike=1.6x0.65", "truck=12x2.5"])
@@ -205,16 +205,13 @@ def test_who_is_beside_is_nobody_s_leader_in_fcd(tmp_path, told, ending):
     assert "is it narrower than 2.5 m? --vehicle-length bike=12x0.8" in " ".join(warnings_of(noted))
 
 
-@pytest.mark.parametrize("told", [{}, {"posLat": 0.0}])
+@pytest.mark.parametrize("told", [(), ("posLat",)])
 def test_who_parks_beside_the_road_is_nobody_s_leader_until_it_is_back(tmp_path, told):
     road = {}
-    for k, beside in enumerate([0.0, 3.2, 3.2, 3.2, 3.2, 0.0, 0.0]):
-        places = [("van", 100.0, beside, 0.0), ("car", 10.0 + 20 * k, 0.0, 20.0)]
-        names = *FIELDS[:4], "x", "y"
-        road[k] = [
-            dict(zip(names, (n, "e", x, v, x, y), strict=True)) | told for n, x, y, v in places
-        ]
-    found = episodes(write(tmp_path / "a.xml", xml(road)))
+    for k, y in enumerate([0.0, 3.2, 3.2, 3.2, 3.2, 0.0, 0.0]):
+        x = 10.0 + 20 * k
+        road[k] = ("van", "e", 100.0, 0.0, 100.0, y, 0.0), ("car", "e", x, 20.0, x, 0.0, 0.0)
+    found = episodes(write(tmp_path / "a.xml", xml(road, (*FIELDS[:4], "x", "y", *told))))
     assert [(times.tolist(), rows[0].tolist()) for rows, _, times in found] == [
         ([0.0], [85.0, 20.0, 0.0]),
         ([5.0, 6.0], [5.0, 0.0, 20.0]),
@@ -240,12 +237,10 @@ def test_who_is_beside_is_nobody_s_leader_among_objects(tmp_path, turned):
 
 def test_who_comes_towards_one_is_nobody_s_leader(tmp_path):
     ways = {"a": (50.0, 90.0), "oncoming": (35.0, 270.0), "b": (20.0, 90.0)}
-    seen = [
-        dict(zip((*FIELDS[:4], "angle"), (name, "e", along, 5.0, angle), strict=True))
-        for name, (along, angle) in ways.items()
-    ]
+    seen = [(name, "e", x, 5.0, angle) for name, (x, angle) in ways.items()]
+    road = xml({0.0: seen}, (*FIELDS[:4], "angle"))
     rows = [(name, 0.0, x, 0, 180.0 - angle, 0, 4, 1) for name, (x, angle) in ways.items()]
-    for path in (write(tmp_path / "a.xml", xml({0.0: seen})), objects(tmp_path / "a.csv", rows)):
+    for path in (write(tmp_path / "a.xml", road), objects(tmp_path / "a.csv", rows)):
         (chunk,) = read_traces([path])
         assert list(chunk.names) == ["b behind a"]
 
