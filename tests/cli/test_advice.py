@@ -52,6 +52,7 @@ def beside(*across):
 CARS = "time,gap,v_follower,v_leader,a_follower"
 LEVEL = "--observe level --action u"
 OWN = "--observe d,v,w --action u --guard car.evofsm"
+OF_KMH = table("time,ego_kmh,u"), "--observe ego_kmh --action u"
 EPOCH = 17 * 10**17
 LAPS = {"time": lambda k: k % 30 / 10, "id": lambda k: k // 30}
 #: A log, how it is read, and where in what is said then stands what is to be added; and its value.
@@ -74,14 +75,8 @@ OPTIONS = {
     "km/h": (table(v_leader=lambda k: 70 + k / 9), "", r"\? (--unit v_leader=km/h) converts", ""),
     "ms": (table(time=lambda k: 100 * k), "", r"\? (--unit time=ms) converts", ""),
     "ns": (table(time=lambda k: EPOCH + 10**8 * k), "", r"\? (--unit time=ns) converts", ""),
-    "called km/h": (
-        *(table("time,ego_kmh,u"), "--observe ego_kmh --action u"),
-        *(r"of the SI: (--unit ego_kmh=km/h) converts", ""),
-    ),
-    "called km/h, and right": (
-        *(table("time,ego_kmh,u"), "--observe ego_kmh --action u"),
-        *(r"\((--unit ego_kmh=m/s): it is right", ""),
-    ),
+    "called km/h": (*OF_KMH, r"of the SI: (--unit ego_kmh=km/h) converts", ""),
+    "called km/h, and right": (*OF_KMH, r"\((--unit ego_kmh=m/s): it is right", ""),
     "no scale": (
         *(table("time,level,u"), LEVEL + " --rule novelty", r": (--scale) level=NUMBER", "level=2"),
     ),

@@ -528,15 +528,13 @@ def test_rows_without_a_leader_end_an_episode(tmp_path, pieces, nothing):
     assert "1 failure lies in rows that are left out" in " ".join(warnings_of(noted))
 
 
-@pytest.mark.parametrize("sign", ["\t", "|"])
+@pytest.mark.parametrize("sign", "\t|")
 @pytest.mark.parametrize("first", ["10,125", "20"])
-def test_decimal_commas_are_known_at_other_signs_by_one_that_parts_no_thousands(
-    tmp_path, sign, first
-):
+def test_decimal_commas_are_known_by_one_that_parts_no_thousands(tmp_path, sign, first):
     gaps = [first] * 6 + ["12,375"]
-    rows = [(k, gap, 10, "0,125" if k == 6 else 9, 1) for k, gap in enumerate(gaps)]
-    lines = [sign.join(map(str, row)) for row in rows]
-    path = write(tmp_path / "a.csv", lines, sign.join(SHORT.split(",")[1:6]))
+    rows = [f"{k} {gap} 10 {'0,125' if k == 6 else 9} 1" for k, gap in enumerate(gaps)]
+    header = "time gap v_follower v_leader a_follower".replace(" ", sign)
+    path = write(tmp_path / "a.csv", [row.replace(" ", sign) for row in rows], header)
     assert together(path)[0] == [float(gap.replace(",", ".")) for gap in gaps]
 
 
