@@ -16,6 +16,11 @@ from evofsm.cli import application
 from evofsm.cli.watch.server import LivePage, Player
 
 
+@pytest.fixture(autouse=True)
+def _in_a_folder_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
 @pytest.fixture(scope="session")
 def evofsm():
     """Run a command as on the command line."""

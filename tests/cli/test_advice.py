@@ -18,11 +18,6 @@ from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
 
-@pytest.fixture(autouse=True)
-def _in_a_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-
 def table(names="time,gap,v_follower,v_leader,a_follower", rows=60, **columns):
     """Text of a CSV: of each column a function of the row, or what it usually has."""
     usual = {

@@ -102,12 +102,11 @@ def test_what_programs_are_told_is_strict_json(evofsm):
     assert driven["episodes"] == 2
 
 
-def test_check_ends_with_1_and_says_what_is_wrong(evofsm, tmp_path, monkeypatch):
-    (tmp_path / "own_driver.py").write_text(
+def test_check_ends_with_1_and_says_what_is_wrong(evofsm, monkeypatch):
+    Path("own_driver.py").write_text(
         "from evofsm.guard import Proposal\nclass Confused:\n"
         "    def propose(self, observation, time=0.0):\n        return Proposal(float('nan'))\n"
     )
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.delitem(sys.modules, "own_driver", raising=False)
     result = evofsm("check", "own_driver:Confused", "--json")

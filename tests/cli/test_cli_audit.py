@@ -1,6 +1,7 @@
 import json
 import re
 import tracemalloc
+from pathlib import Path
 
 import pytest
 
@@ -23,12 +24,9 @@ def log(tmp_path):
     "words",
     [("audit", "huge"), ("monitor", "huge", "--summary"), ("monitor", "--state", "huge.evofsm")],
 )
-def test_a_file_of_one_line_is_refused_by_name_and_not_held_in_memory(
-    evofsm, tmp_path, monkeypatch, words
-):
-    monkeypatch.chdir(tmp_path)
+def test_a_file_of_one_line_is_refused_by_name_and_not_held_in_memory(evofsm, words):
     for name in ("huge", "huge.evofsm.journal"):
-        with open(tmp_path / name, "wb") as file:
+        with open(name, "wb") as file:
             file.truncate(1 << 32)  # without holding that on the disk either
     tracemalloc.start()
     result = evofsm(*words)
@@ -75,10 +73,8 @@ def is_too_close(z):
     return bool(z[0] <= 6.0)
 
 
-def test_what_told_the_guard_where_it_fails_is_named_by_its_module_or_typed(
-    evofsm, refused, tmp_path
-):
-    path, names = tmp_path / "log.jsonl", ("gap", "speed")
+def test_what_told_the_guard_where_it_fails_is_named_by_its_module_or_typed(evofsm, refused):
+    path, names = Path("log.jsonl"), ("gap", "speed")
     with AuditLog(path) as written:
         system = {"low": -2.5, "high": 2.5, "interval": 0.25, "names": names}
         guard = Guard(**system, failed=is_too_close, audit=written)

@@ -119,13 +119,11 @@ def test_learning_that_is_stopped_goes_on_bit_for_bit(tmp_path, snapshot, monkey
         in_turn(folder, 5)
 
 
-def test_who_asks_it_to_stop_loses_nothing_and_no_episode_stands_twice(
-    evofsm, tmp_path, monkeypatch
-):
+def test_who_asks_it_to_stop_loses_nothing_and_no_episode_stands_twice(evofsm, monkeypatch):
     drive, signals = Setup.drive, {1: signal.SIGINT, 3: signal.SIGTERM}
     killed = lambda *rest: (os.kill(os.getpid(), signals.pop(rest[-1], 0)), drive(*rest))[1]  # noqa: E731
     monkeypatch.setattr(Setup, "drive", killed)
-    out, log = tmp_path / "out", tmp_path / "log"
+    out, log = Path("out"), Path("log")
     words = "drive", "emergency", "--episodes", 5, "--json"
     for kept in (2, 4):
         stopped = evofsm(*words, "--out", out, "--audit", log)
@@ -156,16 +154,14 @@ def test_a_folder_of_other_settings_is_refused(tmp_path, changes, says):
     assert "or name another folder" in str(caught.value)
 
 
-def test_what_was_learnt_is_one_of_the_settings_and_two_at_once_are_refused(
-    evofsm, refused, tmp_path
-):
+def test_what_was_learnt_is_one_of_the_settings_and_two_at_once_are_refused(evofsm, refused):
     for name in ("a", "b"):
-        in_turn(tmp_path / name, 1, seed=ord(name))
-    out = ("--episodes", 1, "--out", tmp_path / "out")
-    assert evofsm("drive", "emergency", "--frozen", tmp_path / "a", *out).exit_code == 0
-    assert "digest was" in refused("drive", "emergency", "--frozen", tmp_path / "b", *out)
-    with begun(tmp_path, Setup(EMERGENCY)), pytest.raises(ValueError, match="another process"):
-        in_turn(tmp_path, 1)
+        in_turn(Path(name), 1, seed=ord(name))
+    out = ("--episodes", 1, "--out", "out")
+    assert evofsm("drive", "emergency", "--frozen", "a", *out).exit_code == 0
+    assert "digest was" in refused("drive", "emergency", "--frozen", "b", *out)
+    with begun(Path(), Setup(EMERGENCY)), pytest.raises(ValueError, match="another process"):
+        in_turn(Path(), 1)
 
 
 def test_a_full_disk_is_named_and_what_was_driven_is_kept(tmp_path, monkeypatch):

@@ -5,6 +5,7 @@ import math
 import os
 import random
 import re
+from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
@@ -61,11 +62,9 @@ def test_learn_prints_what_was_read_and_learnt(evofsm, log, monkeypatch, at_once
 @pytest.mark.parametrize(
     ("numbers", "between"), [((0, 1, 2), "-0.5:2.5:1"), ((10, 20, 30), "5:35:10")]
 )
-def test_it_is_said_which_number_is_which_action_and_which_is_none(
-    evofsm, tmp_path, numbers, between
-):
+def test_it_is_said_which_number_is_which_action_and_which_is_none(evofsm, numbers, between):
     rows = [f"{k},{k % 9},{-9999 if k % 40 == 7 else numbers[k % 3]}" for k in range(200)]
-    (path := tmp_path / "log.csv").write_text("\n".join(["time,heat,cmd", *rows]))
+    (path := Path("log.csv")).write_text("\n".join(["time,heat,cmd", *rows]))
     looked = evofsm("learn", path).stdout
     assert f"--action-range {between}" in looked
     assert "; -9999 for none" in looked
@@ -326,7 +325,6 @@ def test_another_rule_is_told_by_its_name(evofsm, log, tmp_path, options, rule):
 def test_a_rule_of_one_s_own_is_named_by_its_module_or_as_it_is_registered(
     evofsm, refused, log, tmp_path, monkeypatch
 ):
-    monkeypatch.chdir(tmp_path)
     write("Add a state rule", tmp_path)
     said = "'coarse'; it must be one of paper, novelty"
     assert said in refused("learn", log, "--rule", "coarse")

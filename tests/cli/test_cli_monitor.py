@@ -259,8 +259,7 @@ def test_a_summary_says_how_often_it_alarms_and_is_risky_and_where_it_is_worst(t
         (("--skip-bad", 0), "--skip-bad is for logs"),
     ],
 )
-def test_what_cannot_be_is_said_in_a_line(refused, arguments, said, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_what_cannot_be_is_said_in_a_line(refused, arguments, said):
     assert said in refused("monitor", *arguments)
 
 

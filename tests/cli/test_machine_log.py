@@ -29,8 +29,7 @@ BOTH = "--observe", f'"{VIBRATION}",{BEARING}', "--action", "", "--hole", "5min"
 
 
 @pytest.fixture(autouse=True)
-def _in_a_folder_of_its_own(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def _in_so_wide_a_terminal(monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
 
 
