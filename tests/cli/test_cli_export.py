@@ -96,6 +96,7 @@ def test_what_cannot_be_exported_is_refused_in_one_line(refused, driven, words, 
         ("guard.evofsm", "drive emergency --out {folder}"),
         ("episodes.csv", "drive emergency --out {folder}"),
         ("guard.evofsm", "learn {path} --action= --out {path}"),
+        ("my.csv", "learn {path} --out {path}"),
     ],
 )
 def test_what_something_else_wrote_is_left_alone(refused, driven, tmp_path, name, words):

@@ -4,9 +4,8 @@ import math
 import re
 import threading
 import time
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import pytest
 from playwright import sync_api as playwright
@@ -18,7 +17,6 @@ from evofsm.cli.options import reading_of
 from evofsm.cli.watch.session import OnRoads, Session, learn_first, read_simulated, watched_log
 from evofsm.driving import KinematicWorld, load_family
 
-PAPER = load_family("paper")
 DISC = str(Path(__file__).parents[2] / "examples/watched_disc.py")
 # Notes where each canvas has words, until it is wiped; answers which of them touch.
 NOTED = """
@@ -45,7 +43,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("compiled")]
 
 
 def cars():
-    roads = OnRoads(PAPER, KinematicWorld())
+    roads = OnRoads(load_family("paper"), KinematicWorld())
     learn_first(roads, 6)
     return Session(roads)
 
@@ -59,23 +57,18 @@ def environment(what):
     return session
 
 
-@contextmanager
 def logged():
     """A machine that heats up until it trips, now and then."""
     times = [(run, k, f"2026-03-0{run + 1} 06:{k:02}:00") for run in range(8) for k in range(60)]
     rows = [(run, time, 20 + k * (run % 2), math.sin(k)) for run, k, time in times]
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "log.csv"
-        lines = ["run,t,a variable of a long name,load", *(",".join(map(str, r)) for r in rows)]
-        path.write_text("\n".join(lines))
-        read = {"observe": "a variable of a long name,load", "action": "", "time": "t"}
-        read["failed"] = '"a variable of a long name">78'
-        words = [word for name, value in read.items() for word in (f"--{name}", value)]
-        learn = ["learn", str(path), *words, "--guard", f"{folder}/guard"]
-        assert CliRunner().invoke(application(), learn).exit_code == 0
-        guard = Guard.load(f"{folder}/guard")
-        with watched_log(str(path), reading_of(**read), guard=guard) as opened:
-            yield opened
+    lines = ["run,t,a variable of a long name,load", *(",".join(map(str, r)) for r in rows)]
+    Path("log.csv").write_text("\n".join(lines))
+    read = {"observe": "a variable of a long name,load", "action": "", "time": "t"}
+    read["failed"] = '"a variable of a long name">78'
+    words = [word for name, value in read.items() for word in (f"--{name}", value)]
+    learn = ["learn", "log.csv", *words, "--guard", "guard"]
+    assert CliRunner().invoke(application(), learn).exit_code == 0
+    return watched_log("log.csv", reading_of(**read), guard=Guard.load("guard"))
 
 
 @pytest.fixture

@@ -18,8 +18,6 @@ from evofsm.driving import KinematicWorld, load_family
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
-PAPER = load_family("paper")
-
 
 @pytest.fixture
 def page(shown):
@@ -29,7 +27,7 @@ def page(shown):
 
 
 def session():
-    return Session(OnRoads(PAPER, KinematicWorld()))
+    return Session(OnRoads(load_family("paper"), KinematicWorld()))
 
 
 def get(page, path, host=None):

@@ -25,7 +25,6 @@ pytestmark = pytest.mark.usefixtures("compiled")
 
 HASTY = IDM(2.25, 28.0, 0.8, 0.3, 2.0, lowest=-4.0, highest=2.5)
 LEADER = Leader(IDM(1.2, 25.0, 1.0, 1.0, 2.5), brake_decel=9.0, brake_time=9.0)
-ROWS = [[30.0 - 2.0 * k, 20.0, 12.0] for k in range(8)]
 
 
 @pytest.fixture(scope="module")
@@ -163,8 +162,8 @@ def test_whoever_connects_sees_the_decisions_as_they_are_made():
             while not isinstance(data, bytes):  # until the server has heard that somebody listens
                 tries += 1
                 assert tries < 600
-                for observation in ROWS:
-                    guard.decide(observation, proposal=1.0)
+                for k in range(8):
+                    guard.decide([30.0 - 2.0 * k, 20.0, 12.0], proposal=1.0)
                 guard.end(failed=True, observation=[-0.1, 20.0, 12.0])
                 with suppress(TimeoutError):
                     data = client.recv(timeout=0.1)

@@ -483,14 +483,13 @@ def test_of_a_trace_that_ends_early_the_beginning_is_read(tmp_path):
 
 def test_osi_that_cannot_be_right_is_refused_in_words(tmp_path):
     (truth, _), path = osi_traces(), tmp_path / "trace.osi"
-    beside = next(osi_traces(lane=0))
     for content, said in (
         (truth[:2], "ends within message 1"),
         (b"\xff\xff\xff\xff", "no trace of OSI"),
         (b"\2\0\0\0\x0b\0", "is not ground truth"),
         (next(osi_traces(length=0.0)), "object 2 is 0 m long, at (50, 0) m"),
         (next(osi_traces(x=math.nan)), "it needs a length and numbers"),
-        (beside, "no vehicle ever follows another one"),
+        (next(osi_traces(lane=0)), "no vehicle ever follows another one"),
         (next(osi_traces(lane=0, length=0.0, x=math.nan)), "no vehicle ever follows"),
         (b"", "no vehicle is in it (empty"),
         (b"\0\0\0\0", "such as SensorData"),

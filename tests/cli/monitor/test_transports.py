@@ -190,19 +190,6 @@ def until(holds):
         time.sleep(0.01)
 
 
-@pytest.fixture
-def alone(tmp_path, monkeypatch):
-    """Zenoh on this computer alone; returns the configuration of a peer."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        place = f"tcp/127.0.0.1:{free.getsockname()[1]}"
-    quiet = {"scouting": {"multicast": {"enabled": False}}, "mode": "peer"}
-    here = tmp_path / "zenoh.json5"
-    here.write_text(json.dumps(quiet | {"listen": {"endpoints": [place]}}))
-    monkeypatch.setenv("ZENOH_CONFIG", str(here))
-    return zenoh.Config.from_json5(json.dumps(quiet | {"connect": {"endpoints": [place]}}))
-
-
 def test_zenoh_refuses_a_key_of_no_one_machine_and_names_what_it_lacks(monkeypatch):
     monkeypatch.setenv("ZENOH_CONFIG", "/no")
     for key, fault in (
@@ -215,7 +202,15 @@ def test_zenoh_refuses_a_key_of_no_one_machine_and_names_what_it_lacks(monkeypat
 
 
 @pytest.mark.slow
-def test_zenoh_carries_the_same(alone, plain):
+def test_zenoh_carries_the_same(tmp_path, monkeypatch, plain):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        place = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    quiet = {"scouting": {"multicast": {"enabled": False}}, "mode": "peer"}
+    here = tmp_path / "zenoh.json5"
+    here.write_text(json.dumps(quiet | {"listen": {"endpoints": [place]}}))
+    monkeypatch.setenv("ZENOH_CONFIG", str(here))  # of this computer alone
+    alone = zenoh.Config.from_json5(json.dumps(quiet | {"connect": {"endpoints": [place]}}))
     answers: queue.Queue = queue.Queue()
     with served(ZenohTransport("car/monitor")) as transport, zenoh.open(alone) as peer:
         peer.declare_subscriber("car/monitor/decision", lambda s: answers.put(s.payload.to_bytes()))
