@@ -70,14 +70,15 @@ def test_of_a_machine_it_is_said_that_failures_are_untold_and_what_was_never_see
 
 def test_what_a_guard_has_learnt_is_said_and_drawn(evofsm, refused, tmp_path):
     guard, file, drawn = Guard(-1.0, 1.0, interval=0.1), tmp_path / "guard", tmp_path / "x.svg"
-    guard.decide([5.0, 0.3], proposal=1.0)
+    for k, place in enumerate((0.0, 0.1, 0.2, 0.25, 0.3)):
+        guard.decide([5.0, place], proposal=k % 2)
     guard.end(failed=True, observation=[5.0, 0.6])
     guard.save(file)
     log = "inspect", file, "--plot", drawn, "--log", "nowhere.csv"
     said = evofsm("inspect", file, "--plot", drawn).stdout
     assert "experience    fails where variable 2 is above 0.3" in said
     assert "<svg" in drawn.read_text()
-    assert "2, one every 0.1 s" in said
+    assert "6, one every 0.1 s" in said
     assert "neither --observe nor names= of a guard: an observation needs" in refused(*log)
     assert "is to be shown beneath a picture: --plot" in refused(*log[:2], *log[4:])
     for wrong, word in ((tmp_path, "is a folder"), (tmp_path / "x", "x.png")):
