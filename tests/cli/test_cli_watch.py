@@ -11,8 +11,6 @@ from evofsm import EvolvingFSM
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
-LOG = ["time,gap,v_follower,v_leader,a_follower", *(f"{k / 10},30,20,20,0" for k in range(20))]
-
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
@@ -27,7 +25,8 @@ LOG = ["time,gap,v_follower,v_leader,a_follower", *(f"{k / 10},30,20,20,0" for k
 def test_it_prints_an_address_that_answers_and_control_c_ends_what_goes_on_hangs_or_broke_off(
     arguments, fault, may, why
 ):
-    Path("log.csv").write_text("\n".join([*LOG, ""]))
+    rows = "".join(f"{k / 10},30,20,20,0\n" for k in range(20))
+    Path("log.csv").write_text(f"time,gap,v_follower,v_leader,a_follower\n{rows}")
     Path("own.py").write_text(
         "import gymnasium, os, time\nenvironment = lambda: gymnasium.make('Pendulum-v1')\n"
         f"controller = lambda *_: [0.0 if not os.path.exists('armed') else {fault or 0.0}]\n"

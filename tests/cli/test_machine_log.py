@@ -26,6 +26,7 @@ from evofsm.io import LogColumns, episodes_of, read_traces
 VIBRATION, BEARING = "Schwingung, mm/s", "Lagertemperatur °C"
 RUNS = "--where", "Drehzahl>100", "--failed", "Status==Störung"
 BOTH = "--observe", f'"{VIBRATION}",{BEARING}', "--action", "", "--hole", "5min", *RUNS
+TRIPS = "--observe", "heat", "--action", "", "--time", "t", "--failed", "trip"
 
 
 @pytest.fixture(autouse=True)
@@ -271,8 +272,7 @@ def test_failures_right_after_a_hole_are_counted_wherever_others_are(evofsm):
         rows.append(f"{time},{chance.gauss(9, 0.1):.2f},1")
         time += 7200
     Path("holes.csv").write_text("\n".join(["t,heat,trip", *rows]))
-    asked = "--observe", "heat", "--action", "", "--time", "t", "--failed", "trip"
-    asked = *asked, "--hole", "10min"
+    asked = *TRIPS, "--hole", "10min"
     novelty = "--rule", "novelty", "--scale", "heat=1", "--guard", "holes.evofsm"
     learnt = evofsm("learn", "holes.csv", *asked, *novelty)
     assert "24 episodes ended with trip" in " ".join(learnt.stdout.split())
@@ -295,8 +295,7 @@ def test_an_alarm_that_came_long_before_counts_once_in_each_horizon(evofsm):
         heat = f"{5 + rises + chance.gauss(0, 0.2):.2f}"
         rows.append(f"{run},{60 * (k + 1000 * run)},{heat},{int(run % 2 and k == 299)}")
     Path("wear.csv").write_text("\n".join(rows))
-    asked = "--observe", "heat", "--action", "", "--time", "t", "--failed", "trip"
-    told = evofsm("monitor", "wear.csv", "--summary", *asked, "--horizon", "20min").stdout
+    told = evofsm("monitor", "wear.csv", "--summary", *TRIPS, "--horizon", "20min").stdout
     assert "; one that stays on counts anew each 20 min" in " ".join(told.split())
     assert re.findall(r"^(\d+) .* h  yes, the last of [78] ", told, re.M) == ["18"]
 
@@ -360,8 +359,7 @@ def test_live_rows_stand_as_in_the_log_and_what_cannot_be_compared_is_refused(ev
 def test_live_rows_of_several_machines_become_no_means_of_them(evofsm):
     log = [f"{k},A,{max(6, k % 40)},{int(k > 42 and k % 40 < 3)}" for k in range(243)]
     Path("log.csv").write_text("\n".join(["t,asset,heat,trip", *log]))
-    asked = "--observe", "heat", "--action", "", "--time", "t", "--failed", "trip"
-    asked = *asked, "--resample", "2s", "--episode", "asset", "--rule", "novelty"
+    asked = *TRIPS, "--resample", "2s", "--episode", "asset", "--rule", "novelty"
     assert not evofsm("learn", "log.csv", *asked, "--scale", "heat=9", "--guard", "g").exit_code
     rows = [row for k, one in enumerate(log) for row in (one, f"{k},B,5,0", f"{k},C,5,0")]
     Path("live.csv").write_text("\n".join(["t,asset,heat,trip", *rows]))
