@@ -144,7 +144,7 @@ def test_who_decides_once_an_episode_is_told_that_nothing_is_learnt():
         reason = guard.decide([x, 0.0], 2).reason
         guard.end(bool(x > 0.0), [x, 10.0 * (x > 0.0)], terminated=True)
     for text in (reason, str(guard)):
-        assert "nothing was learnt: no episode had three observations in a row" in text
+        assert "nothing was learnt: no episode had four observations before it failed" in text
 
 
 def test_told_what_failure_is_it_keeps_from_the_first_one(point):

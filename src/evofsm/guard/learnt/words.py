@@ -39,8 +39,8 @@ from evofsm.guard.learnt.state import State
 #: Said as long as there is nothing to judge by.
 NOTHING_LEARNT = "nothing was learnt yet"
 NEVER_WHOLE = (
-    "nothing was learnt: no episode had three observations in a row without NaN, with actions of "
-    "the guard's range between them"
+    "nothing was learnt: no episode had four observations before it failed, three in a row without "
+    "NaN, with actions of the guard's range between them"
 )
 NOTHING_SEEN = "not each variable was observed yet in this episode"
 #: Said where it is far from all that was seen, or was not seen whole for long.
