@@ -116,6 +116,12 @@ def test_in_words_it_is_said_where_an_alarm_goes_blind_and_what_stands():
     standing = [standing for _, standing in told]
     assert standing[:3] == ["", stands, f"2  alarm, for 1 s: {lost}"]
     assert standing[6:8] == ["6  not seen: oil", ""]
+    more = {**usual, "reason": "not seen: heat, oil; the alarm stays on"}
+    unknown = {**over, "risk_proposed": None, "reason": "nothing is seen"}
+    said = "".join(text.line(one).decode() for one in (blind, more, more, blind, unknown, usual))
+    told = [one["reason"] for one in (blind, more, blind)]
+    told += ["over", "nothing is seen", stands[3:], "the risk is known again"]
+    assert said.splitlines() == told
 
 
 def test_gaps_in_time_and_rows_that_come_too_often_are_noted():

@@ -24,7 +24,6 @@ _LONGEST_MESSAGE = 1 << 20  # a line of more bytes is of another kind of file
 _TOLERANCES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)  # beside the guard's own tolerance
 # So many moments and variables are shown; without an alarm a moment lasts so long [s].
 _WORST, _MOST_VARIABLES, _MOMENT = 10, 4, 5.0
-_ALL_SEEN = "all is seen again"  # said after a variable was lost in an alarm
 
 
 class Text:
@@ -32,7 +31,7 @@ class Text:
 
     def __init__(self) -> None:
         self._since: float | None = None  # when the alarm began that is on [s]
-        self._again = ""  # what is said once it is known, or seen, again; empty while it is
+        self._lacks = False, ""  # is the risk unknown, and what an alarm lost, until all is seen
         self.standing = ""  #: the alarm that is on, or why the risk is not known; mostly nothing
         self._counts: dict[str, int] = {}  # of notes and refusals alike
 
@@ -70,13 +69,16 @@ class Text:
                 self._since = time if is_new else None
                 yield when + (f"alarm: {reason}" if is_new else over)
             is_blind = part["risk_proposed"] is None and part.get("ahead", "") is not None
-            is_partly = "not seen: " in reason and (part["alarm"] or self._again == _ALL_SEEN)
-            again = "the risk is known again" if is_blind else _ALL_SEEN * is_partly
-            if bool(again) != bool(self._again) and not (again and is_new):
-                yield f"{when}{reason if again else self._again}"
-            self._again = again
+            gaps = reason.partition("not seen: ")[2].partition("; ")[0]
+            gaps = gaps if part["alarm"] else self._lacks[1] * bool(gaps)
+            before, self._lacks = self._lacks, (is_blind, gaps)
+            if before != self._lacks and not (is_new and any(self._lacks)):
+                text = reason if any(self._lacks) else "all is seen again"
+                if before[0] and not is_blind:
+                    text = "the risk is known again" + f": {reason}" * bool(gaps)
+                yield f"{when}{text}"
             alarm = f"alarm{after and f', for{after}'}: " * part["alarm"]
-            self.standing = f"{when}{alarm}{reason}" if alarm or again else ""
+            self.standing = f"{when}{alarm}{reason}" if alarm or any(self._lacks) else ""
 
 
 def _refusal(answer: Answer) -> str:
