@@ -62,7 +62,8 @@ def show_foreseen(
     as_json: bool,
 ) -> None:
     """Say what came of the alarms of a guard, or of one that learns from the log's first part."""
-    title, held_out, before = str(file), "; not held out, if this guard learnt from them", 0
+    title, held_out = str(file), "; not held out, if this guard learnt from them"
+    first = before = 0
     if guard is None:
         rows = np.cumsum([len(e.times) for e in episodes])
         first = int((rows <= split * rows[-1]).sum())
@@ -83,6 +84,7 @@ def show_foreseen(
         title += f": learnt from its first {learnt_from}, judged by the rest"
         held_out = f", held out (the last {1.0 - rows[first - 1] / rows[-1]:.0%} of the rows)"
     at_once = sum(e.failed for e in episodes if len(e.times) == 1)
+    numbers = [k for k, e in enumerate(episodes, first) if len(e.times) > 1]
     episodes = _of_two_rows(episodes)
     judge = guard.judge
     if not isinstance(judge, Foresight):
@@ -94,9 +96,9 @@ def show_foreseen(
     document = {**_document(judge, runs, times, columns), "failures_at_once": at_once}
     document["episodes_before"] = before
     for entry in (*document["listed"], *document["missed"]):
-        entry["episode"] += before  # counted in the log, as `evofsm watch` does
+        entry["episode"] = numbers[entry["episode"]]  # counted in the log, as `evofsm watch` does
     if plot is not None:
-        _draw(judge, guard.machine, runs, times, document, plot)
+        _draw(judge, guard.machine, runs, numbers, times, document, plot)
     if as_json:
         print_json({"file": file, **document})
     else:
@@ -235,6 +237,7 @@ def _draw(
     judge: Foresight,
     machine: EvolvingFSM | None,
     runs: Runs,
+    numbers: Sequence[int],
     times: Floats,
     document: dict[str, Any],
     out: Path,
@@ -252,10 +255,10 @@ def _draw(
     for kind, word in ((1, "foreseen"), (2, "not foreseen")):
         ends = np.flatnonzero(failures == kind)
         if len(ends):  # the one whose episode lasted as long as most
-            numbers = np.searchsorted(runs.last, ends)
-            typical = int(np.argsort(runs.lengths[numbers])[len(ends) // 2])
-            first, last = int(runs.starts[numbers[typical]]), int(ends[typical])
-            title = f"{word}: episode {document['episodes_before'] + numbers[typical] + 1:,}"
+            places = np.searchsorted(runs.last, ends)
+            typical = int(np.argsort(runs.lengths[places])[len(ends) // 2])
+            first, last = int(runs.starts[places[typical]]), int(ends[typical])
+            title = f"{word}: episode {numbers[places[typical]] + 1:,}"
             title += f", {date(times[last])}" * bool(times[last] >= DATES)
             parts[title] = slice(max(first, last - 4 * judge.horizon), last + 1)
     names = [judge.labels.variable(v) for v in range(runs.rows.shape[1])]
