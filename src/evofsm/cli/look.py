@@ -135,7 +135,7 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     counts = not clock or _FRAME.match(clock) is not None
     options = [("--dt", "1")] if counts and not form else [("--time", clock or form)]
     options += [("--unit", form)] if form and not counts else []
-    bad = sum(n for n, _ in skips.values()) + sum(odd.values())
+    bad = sum(n for kind, (n, _) in skips.items() if kind != "letter") + sum(odd.values())
     if not counts:
         at = frame[clock].to_numpy()[order]
         there = {name: np.isfinite(z[order]) for name, z in values.items()}
