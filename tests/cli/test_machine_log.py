@@ -169,6 +169,9 @@ def test_a_first_look_says_what_is_odd_in_a_log(evofsm, refused):
     found = evofsm("learn", "km.csv").stdout
     assert "km: never comes back" in found
     assert "--observe level " in found
+    rows = [f"{k % 50},{k},{k % 7}" for k in range(400)]
+    Path("laps.csv").write_text("\n".join(["lap_time,frame,heat", *rows]))
+    assert "--dt 1 " in evofsm("learn", "laps.csv").stdout
     rows = "0,5", "99999,5", *(f"{k},{k % 7}" for k in range(1, 400))
     Path("late.csv").write_text("\n".join(["t,heat", *rows]))
     found = evofsm("learn", "late.csv").stdout

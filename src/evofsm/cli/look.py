@@ -265,10 +265,12 @@ def _clock_of(frame: polars.DataFrame, names: Sequence[str]) -> tuple[str, str, 
     for name in (*filter(_TIME.match, epochs), *epochs):
         since = {"d": "1899-12-30, as Excel has it"}.get(epochs[name], "1970")
         return name, epochs[name], f", {epochs[name]} since {since}"
-    likely = (name for name in names if any(map(_CLOCK.fullmatch, _WORDS.findall(name))))
-    signs = ((name, np.sign(np.diff(frame[name].drop_nans().to_numpy()))) for name in likely)
-    runs = [name for name, sign in signs if sign.sum() > 0.8 * abs(sign).sum() > 0.0]
-    clocks = *filter(_TIME.match, names), *runs, *filter(_FRAME.match, names)
+    counts = [*filter(_FRAME.match, names)]
+    likely = [name for name in names if any(map(_CLOCK.fullmatch, _WORDS.findall(name)))]
+    pairs = ((n, np.sign(np.diff(frame[n].drop_nans().to_numpy()))) for n in (*likely, *counts))
+    rises = {name: sign.sum() / max(1.0, abs(sign).sum()) for name, sign in pairs}
+    least = 1.0 if any(rises[name] == 1.0 for name in counts) else 0.8  # a time of laps falls
+    clocks = *filter(_TIME.match, names), *(n for n in likely if rises[n] >= least), *counts
     clock = next((name for name in clocks if frame[name].drop_nans().n_unique() > 1), "")
     most = float(str(frame[clock].abs().max())) if clock else 0.0
     return clock, next((unit for unit, n in _EPOCHS.items() if most > 1e8 * n), "s"), ""
