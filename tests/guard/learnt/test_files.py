@@ -59,9 +59,11 @@ def with_tolerance(value):
         (with_tolerance(-1), "tolerance"),
         (with_tolerance(None), "tolerance is None"),
         ({"judge": lambda array: array[:0]}, "what its LearntRisk has learnt is missing"),
+        ({"machine": lambda array: array[:-7]}, "cannot be loaded"),
+        ({"reviser": lambda one: one | {"class": "Nobody"}}, "cannot be loaded"),
     ],
 )
-def test_a_forged_tolerance_and_a_missing_judge_are_refused(points, forge, tmp_path, change, why):
+def test_a_guard_with_a_forged_or_missing_part_is_refused(points, forge, tmp_path, change, why):
     path = tmp_path / "guard"
     points["box"].guard().save(path)
     forge(path, change)
@@ -73,9 +75,11 @@ def test_a_judge_of_other_actions_or_variables_is_refused(points, snapshot):
     box, plane = (points[name].taught(3) for name in ("box", "plane"))
     files = [BytesIO(snapshot(guard)) for guard in (box, plane)]
     (told, own), (_, others) = (store.read(file, GUARD) for file in files)
-    store.write(mixed := BytesIO(), GUARD, told, own | {"judge": others["judge"]})
-    with pytest.raises(ValueError, match=r"made for BoxActions\(.*, but the guard has Interval"):
-        Guard.load(BytesIO(mixed.getvalue()))
+    fits_not = r"made for BoxActions\(.*, but the guard has Interval"
+    for judge, why in ((others["judge"], fits_not), (own["machine"], "cannot be loaded")):
+        store.write(mixed := BytesIO(), GUARD, told, own | {"judge": judge})
+        with pytest.raises(ValueError, match=why):
+            Guard.load(BytesIO(mixed.getvalue()))
     with pytest.raises(ValueError, match=r"made for BoxActions\(.*, but the guard has Choices"):
         Guard(n_actions=2, interval=0.1, judge=LearntRisk(0.1, 0.0, 1.0))
     guard = Guard(low=-1.0, high=1.0, interval=0.1, judge=box.judge).copy(states=False)
