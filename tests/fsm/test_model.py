@@ -4,32 +4,9 @@ import pickle
 import numpy as np
 import pytest
 
-from evofsm import EvolvingFSM, FSMModel, IntervalActions, Novelty
-from evofsm.fsm.arrays import OF_ACTIONS, SUMS
+from evofsm import EvolvingFSM, IntervalActions, Novelty
 
 ACTIONS = IntervalActions(low=-1.0, high=1.0, width=1.0)
-
-
-def chain(*matrices, decisions=0.0):
-    """A model with the given transition matrices; the rest is of no account."""
-    q, n = len(matrices), len(matrices[0])
-    return FSMModel(
-        centers=np.arange(2.0 * n).reshape(n, 2),
-        potentials=np.ones(n),
-        width=1.0,
-        transition_matrices=np.array(matrices),
-        origin_frequency=np.ones((q, n)),
-        uses=np.ones(q),
-        created=np.arange(1.0, n + 1),
-        changes=np.zeros((n, n)),
-        **{name: np.zeros(n) for name in (*SUMS, "joined")},
-        **{name: np.zeros((q, n)) for name in OF_ACTIONS if name != "decisions"},
-        decisions=np.zeros((q, n)) + decisions,
-    )
-
-
-SWITCH = [[0.9, 0.1], [0.5, 0.5]]
-STAY = [[1.0, 0.0], [0.0, 1.0]]
 
 
 # -- A snapshot --------------------------------------------------------------------------------
@@ -53,13 +30,13 @@ def test_nothing_in_a_snapshot_can_be_changed(grown):
     [
         ({"names": ("x",)}, "names are .*2 variables"),
         ({"units": ("m", "m", "s")}, "units are .*2 variables"),
-        ({"actions": ACTIONS}, "2 intervals for 1 matrices"),
+        ({"actions": ACTIONS}, "2 intervals for 3 matrices"),
         ({"dt": 0.0}, "dt of 0 cannot be right"),
     ],
 )
-def test_parts_that_do_not_fit_each_other_are_refused(change, words):
+def test_parts_that_do_not_fit_each_other_are_refused(grown, change, words):
     with pytest.raises(ValueError, match=words):
-        dataclasses.replace(chain(STAY), **change)
+        dataclasses.replace(grown.model(), **change)
 
 
 # -- Recognition -------------------------------------------------------------------------------
@@ -120,10 +97,10 @@ def test_at_the_start_of_an_episode_the_forecast_comes_from_the_uniform_belief(m
     np.testing.assert_allclose(machine.predict(0), [2 / 3, 1 / 3], rtol=1e-15)
 
 
-def test_without_an_action_all_count_alike_from_the_first_step_on():
-    model = chain(SWITCH, STAY, decisions=[[3.0, 3.0], [1.0, 1.0]])
-    np.testing.assert_allclose(model.propagate([1.0, 0.0]), [0.95, 0.05])
-    np.testing.assert_allclose([1.0, 0.0] @ model.averaged_matrix, [0.925, 0.075])
+def test_without_an_action_all_count_alike_from_the_first_step_on(machine):
+    model = dataclasses.replace(machine.model(), decisions=np.array([[3.0, 3.0], [1.0, 1.0]]))
+    np.testing.assert_allclose(model.propagate([1.0, 0.0]), [3 / 7, 4 / 7])
+    np.testing.assert_allclose([1.0, 0.0] @ model.averaged_matrix, [13 / 28, 15 / 28])
 
 
 @pytest.mark.parametrize(
@@ -137,9 +114,9 @@ def test_without_an_action_all_count_alike_from_the_first_step_on():
         ({"horizon": 0}, "horizon is 0"),
     ],
 )
-def test_a_forecast_that_makes_no_sense_is_refused(arguments, words):
+def test_a_forecast_that_makes_no_sense_is_refused(machine, arguments, words):
     with pytest.raises(ValueError, match=words):
-        chain(SWITCH, STAY).propagate(**{"belief": [1.0, 0.0], "action": 0, **arguments})
+        machine.model().propagate(**{"belief": [1.0, 0.0], "action": 0, **arguments})
 
 
 def test_steps_are_shown_in_a_line():
