@@ -106,18 +106,22 @@ def test_what_is_new_is_said_to_be(machine):
 
 
 @pytest.mark.parametrize(
-    ("situation", "action", "error", "says"),
+    ("told", "error", "says"),
     [
-        (2, None, ValueError, "state is 2; there are states 0 to 1"),
-        (0.5, None, TypeError, "state is 0.5"),
-        ([1.0], None, ValueError, "the model has 2 states"),
-        ([0.5, 0.9], None, ValueError, "belief"),
-        (0, 2, ValueError, "action is 2"),
+        ({"situation": 2}, ValueError, "state is 2; there are states 0 to 1"),
+        ({"situation": 0.5}, TypeError, "state is 0.5"),
+        ({"situation": [1.0]}, ValueError, "the model has 2 states"),
+        ({"situation": [0.5, 0.9]}, ValueError, "belief"),
+        ({"situation": 0, "action": 2}, ValueError, "action is 2"),
+        ({}, ValueError, "either a situation or an observation"),
+        ({"situation": 0, "observation": [0.0]}, ValueError, "either a situation or an obs"),
+        ({"observation": [0.0, 1.0]}, ValueError, "z has shape"),
+        ({"observation": np.zeros((2, 3))}, ValueError, "2 observations; one"),
     ],
 )
-def test_what_cannot_be_explained_is_refused(machine, situation, action, error, says):
+def test_what_cannot_be_explained_is_refused(machine, told, error, says):
     with pytest.raises(error, match=says):
-        machine.model().explain(situation, action)
+        machine.model().explain(**told)
 
 
 # -- Failures that nobody told of ------------------------------------------------------------------
@@ -191,17 +195,6 @@ def test_what_lies_far_from_every_state_was_never_seen_whatever_the_belief(rule,
     assert far.text.startswith("Never seen, as far as the states tell")
     assert (far.here, far.visits, far.action) == (Tally(0, 0), 0, None)
     assert far.state == model.recognise([never]).argmax()
-
-
-def test_either_a_situation_or_an_observation_is_explained():
-    model = untold().model()
-    for wrong in ({}, {"situation": 0, "observation": [0.0]}):
-        with pytest.raises(ValueError, match="either a situation or an observation"):
-            model.explain(**wrong)
-    with pytest.raises(ValueError, match="z has shape"):
-        model.explain(observation=[0.0, 1.0])
-    with pytest.raises(ValueError, match="2 observations; one"):
-        model.explain(observation=[[0.0], [1.0]])
 
 
 def test_what_came_after_an_action_is_part_of_what_came_here():

@@ -24,18 +24,9 @@ from pettingzoo.utils import aec_to_parallel, parallel_to_aec
 
 from evofsm import Guard, Labels
 from evofsm.driving import CarFollowing, guard_for_cars
-from evofsm.guard import (
-    AuditLog,
-    Fallback,
-    Judgement,
-    LearningJudge,
-    Mode,
-    RevisedActions,
-    RevisedAgents,
-    RevisedVectorActions,
-    Search,
-    run_episode,
-)
+from evofsm.guard import AuditLog, Fallback, Judgement, LearningJudge, Mode, Search, run_episode
+from evofsm.guard.gym import RevisedActions, RevisedVectorActions
+from evofsm.guard.pettingzoo import RevisedAgents
 
 pytestmark = pytest.mark.filterwarnings("ignore:nobody says which", "ignore:the guard's actions")
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -9,25 +9,8 @@ from studies.judges import run
 from studies.systems import Start, make_system
 
 from evofsm import Guard
-from evofsm.guard.learnt.failure import (
-    AT,
-    HELD,
-    SAYS,
-    TO,
-    B,
-    C,
-    I,
-    J,
-    Survived,
-    are_sides,
-    boxed,
-    crashing,
-    distances,
-    explain,
-    inside,
-    rivals,
-    sides_of,
-)
+from evofsm.guard.learnt import failure
+from evofsm.guard.learnt.failure import AT, HELD, SAYS, TO, B, C, I, J, Survived, inside
 from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS
 
 SHAPES = {
@@ -52,11 +35,11 @@ def test_a_single_failure_amid_what_was_survived_says_nothing_of_where_it_fails(
     seen = random.uniform(-1.0, 1.0, (2000, 2))
     known = survived_as(seen[np.hypot(*(seen - at).T) > 0.05], np.full(2, 0.1))
     beyond = np.column_stack([random.uniform(1.0, 1.2, 15), random.uniform(-1.0, 1.0, 15)])
-    told = explain(FAILS, np.vstack([beyond, at]), known)
-    assert are_sides(told).all()
+    told = failure.explain(FAILS, np.vstack([beyond, at]), known)
+    assert failure.are_sides(told).all()
     assert inside(told, beyond).any(0).all()
     again = np.vstack([beyond, at + random.uniform(-0.02, 0.02, (9, 2))])
-    assert inside(explain(FAILS, again, known), again).any(0).all()
+    assert inside(failure.explain(FAILS, again, known), again).any(0).all()
 
 
 def test_of_failures_by_chance_a_form_of_one_says_nothing():
@@ -64,9 +47,9 @@ def test_of_failures_by_chance_a_form_of_one_says_nothing():
     random = np.random.default_rng(1)
     seen, rim = random.uniform(-1.0, 1.0, (2000, 2)), np.array([[0.97, 0.97]])
     known = survived_as(seen[(seen < 0.9).any(1)], np.full(2, 0.1))
-    assert len(explain(FAILS, rim, known)) == 1
+    assert len(failure.explain(FAILS, rim, known)) == 1
     by_chance = np.vstack([rim, random.uniform(-0.8, 0.8, (10, 2))])
-    assert (explain(FAILS, by_chance, known)[:, HELD] > 1).all()
+    assert (failure.explain(FAILS, by_chance, known)[:, HELD] > 1).all()
 
 
 def test_among_failures_by_chance_a_threshold_at_which_many_failed_stays():
@@ -75,7 +58,7 @@ def test_among_failures_by_chance_a_threshold_at_which_many_failed_stays():
     known = survived_as(np.vstack([rows, [3.0, 0.0]]), np.ones(2))
     known = known._replace(highest=np.array([[3.0, 2.0], [2.0, 2.0]]))
     at_end = np.column_stack([np.full(12, 3.0), random.uniform(0.0, 2.0, 12)])
-    told = explain(FAILS, np.vstack([at_end, random.integers(0, 3, (14, 2))]), known)
+    told = failure.explain(FAILS, np.vstack([at_end, random.integers(0, 3, (14, 2))]), known)
     assert inside(told, at_end).all()
 
 
@@ -84,13 +67,13 @@ def test_forms_explain_failures_and_nothing_that_was_survived_is_inside(shape):
     seen = np.random.default_rng(0).uniform(-2.0, 2.0, (2000, 3))
     fails = SHAPES[shape](seen)
     failures, survived = seen[fails][:40], seen[~fails]
-    forms = explain(FAILS, failures, survived_as(survived, UNIT))
+    forms = failure.explain(FAILS, failures, survived_as(survived, UNIT))
     assert len(forms) <= 3
-    assert not are_sides(forms).any()
+    assert not failure.are_sides(forms).any()
     assert inside(forms, failures).any(0).mean() >= 0.95
-    assert (distances(forms, survived) > 0.0).all()
+    assert (failure.distances(forms, survived) > 0.0).all()
     elsewhere = np.random.default_rng(1).uniform(-2.0, 2.0, (2000, 3))
-    said = (distances(forms, elsewhere) < 0.0).any(0)
+    said = (failure.distances(forms, elsewhere) < 0.0).any(0)
     assert (said != SHAPES[shape](elsewhere)).mean() < 0.06
 
 
@@ -99,8 +82,8 @@ def test_the_walls_of_a_room_stay_thresholds_of_which_each_explains_a_few():
     survived, failures = rng.uniform(-1.0, 1.0, (3000, 9)), rng.uniform(-0.9, 0.9, (33, 9))
     walls = np.arange(32) % 8
     failures[:32][np.arange(32), walls // 2] = np.where(walls % 2, 1.01, -1.01)  # one has none
-    forms = explain(FAILS, failures, survived_as(survived, np.full(9, 0.02)))
-    held = {(int(row[I]), row[B]) for row in forms[are_sides(forms)]}
+    forms = failure.explain(FAILS, failures, survived_as(survived, np.full(9, 0.02)))
+    held = {(int(row[I]), row[B]) for row in forms[failure.are_sides(forms)]}
     assert held >= {(k, sign) for k in range(4) for sign in (-1.0, 1.0)}
 
 
@@ -127,14 +110,14 @@ ABOVE_ALONE = np.array([[0.0, 0.2], [0.2, 0.2]])  # who stands, does not fail fo
 )
 def test_failures_are_explained_by_ends_of_what_was_survived(failures, blur, ends):
     known = survived_as(np.linspace([0.0, 0.0], [10.0, 10.0], 40), np.ones(2))
-    found = sides_of(FAILS, np.array(failures), known._replace(noise=blur))
+    found = failure.sides_of(FAILS, np.array(failures), known._replace(noise=blur))
     assert (found[:, C] == 0.0).all()
     assert {(int(i), sign, at) for i, sign, at in found[:, [I, B, AT]].tolist()} == ends
 
 
 def test_of_flags_those_failures_count_in_which_they_were_set():
     failures = np.repeat(np.eye(3), [5, 2, 1], axis=0)
-    found = sides_of(FAILS, failures, survived_as(np.zeros((40, 3)), np.ones(3)))
+    found = failure.sides_of(FAILS, failures, survived_as(np.zeros((40, 3)), np.ones(3)))
     assert found[:, HELD].tolist() == [5.0, 2.0, 1.0]
 
 
@@ -149,7 +132,7 @@ def test_a_disc_is_learnt_said_and_no_threshold(snapshot, reloaded):
     state = taught.judge.state
     assert (state.forms[:, SAYS] == FAILS).any()
     survived = np.concatenate([state.survived, state.brinks])
-    assert (distances(state.forms, survived) > 0.0).all()
+    assert (failure.distances(state.forms, survived) > 0.0).all()
     assert "ellipse of variable 1 and variable 2 around (" in taught.judge.told_by_experience
     assert taught.told_here([0.0, 0.0, 0.0, 0.0]).startswith("This is where it fails: inside")
     assert "typical steps from where it fails" in taught.told_here([-0.9, 0.0, 0.0, 0.0])
@@ -167,8 +150,8 @@ def test_a_rival_reaches_inwards_where_failures_lie_on_a_rim_that_was_skimmed():
     rows = rows[np.hypot(*rows.T) > 0.8]
     rows = rows[rows[:, 0] < 0.5]  # nobody came to the other side yet
     known = survived_as(rows, np.full(2, 0.02))
-    table = explain(FAILS, failures, known)
-    tried = rivals(table, failures, known)
+    table = failure.explain(FAILS, failures, known)
+    tried = failure.rivals(table, failures, known)
     assert inside(tried, failures).any(0).all()
     assert not inside(tried, rows, blur=0.0).any()
     far = np.array([[2.0, 0.0], [2.0, 2.0], [2.0, -2.0]])
@@ -182,7 +165,7 @@ def test_a_rival_of_a_threshold_fails_only_as_failures_did(ended):
     rows = np.column_stack([rng.uniform(0.0, 5.0, 500), rng.normal(0.0, [0.6, 0.3], (500, 2))])
     failures = np.array([[-0.1, -1.4, 0.6], [-0.1, -1.2, -0.7], [-0.1, -1.1, 0.5]])
     known = survived_as(rows, np.full(3, 0.02), ended)
-    tried = rivals(sides_of(FAILS, failures, known), failures, known)
+    tried = failure.rivals(failure.sides_of(FAILS, failures, known), failures, known)
     says, touches = tried[:, SAYS], np.array([[-0.1, -0.1, 0.0], *failures])
     assert inside(tried[says == ENDS], touches).any(0).all()
     assert inside(tried[says == CRASHES], touches).any(0).tolist() == [False, True, True, True]
@@ -193,12 +176,12 @@ def test_a_rival_of_a_crash_asks_how_far_out_failures_were():
     rows = np.random.default_rng(2).uniform([0.0, -2.0, -1.0], [5.0, 2.0, 1.0], (500, 3))
     failures = np.array([[-0.1, -1.4, 0.1], [-0.1, -1.2, -0.2], [-0.1, -0.5, -0.9]])
     known = survived_as(rows, np.full(3, 0.02), [[-0.1, -0.3, 0.2], [-0.1, -0.4, 0.3]])
-    ends = explain(ENDS, known.ended, boxed(known, rows))
-    table = np.vstack([ends, crashing(failures, known.ended, known, 0)])
+    ends = failure.explain(ENDS, known.ended, failure.boxed(known, rows))
+    table = np.vstack([ends, failure.crashing(failures, known.ended, known, 0)])
     table[1:] = table[1]
     table[1:, [I, J]], table[1:, [AT, TO]], table[1:, B] = 2, 0.19, -1.0  # tilted less
     touches = np.array([[-0.1, -0.3, 0.0], [-0.1, -1.3, 0.25], *failures])
-    tried = rivals(table, failures, known)
+    tried = failure.rivals(table, failures, known)
     for forms, crash in ((table, [1, 0, 1, 1, 1]), (tried, [0, 1, 1, 1, 1])):
         says = forms[:, SAYS]
         assert inside(forms[says == CRASHES], touches, 0.0).any(0).tolist() == crash

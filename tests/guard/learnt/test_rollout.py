@@ -3,16 +3,9 @@
 import numpy as np
 import pytest
 
+from evofsm.guard.learnt import rollout
 from evofsm.guard.learnt.backups import regulator
-from evofsm.guard.learnt.rollout import (
-    CHANGED,
-    FAILS,
-    KEPT,
-    NOTHING_PASSES,
-    Model,
-    n_features,
-    search,
-)
+from evofsm.guard.learnt.rollout import CHANGED, FAILS, KEPT, NOTHING_PASSES, Model
 
 STEPS, WALL = 20, 100.0
 ACTION = 3  # index of the first one among the features: after 1, the variable, its latest change
@@ -21,7 +14,7 @@ ACTION = 3  # index of the first one among the features: after 1, the variable, 
 def mover(choices=0):
     """One variable, moved by the action, or by the last of two choices; fails at a wall."""
     a = max(1, choices)
-    weights = np.zeros((n_features(1, a, box=not choices), 1))
+    weights = np.zeros((rollout.n_features(1, a, box=not choices), 1))
     weights[ACTION + a - 1] = 1.0
     one, none = np.ones(1), np.zeros(1)
     return Model(
@@ -45,7 +38,7 @@ def search_for(model, proposal, policies, margin=0.0, place=0.0, residuals=None,
     residuals = np.zeros((STEPS, 1, 1)) if residuals is None else residuals
     here, policies = np.array([place, 0.0, *[0.0] * len(proposal)]), np.array(policies)
     asked = here, policies, np.arange(len(policies)), residuals, 1.0, np.array(proposal)
-    return search(model, *asked, margin, allowed)
+    return rollout.search(model, *asked, margin, allowed)
 
 
 def test_where_full_action_only_just_holds_nothing_passes():
