@@ -11,17 +11,10 @@ import numpy as np
 import pytest
 
 from evofsm import Guard, IntervalActions
-from evofsm.driving import (
-    EnvelopeReviser,
-    LatentRisk,
-    attach,
-    attached,
-    guard_for_cars,
-    guard_for_traffic,
-    measures,
-)
-from evofsm.driving.attached import choose
-from evofsm.driving.traffic import Role
+from evofsm.driving import EnvelopeReviser, LatentRisk, attached, measures
+from evofsm.driving.attached import attach, choose
+from evofsm.driving.cars import guard_for_cars
+from evofsm.driving.traffic import Role, guard_for_traffic
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "your-own-sumo"
 NO_GAP = ("--collision.mingap-factor", "0")
@@ -419,16 +412,10 @@ def test_a_car_that_a_script_stops_stays_stopped_until_the_script_lets_it_go(roa
 
 def test_sumo_as_referee_measures_the_same(road, tmp_path):
     """SUMO's SSM device, at every step."""
-    given = {
-        "has.ssm.device": "true",
-        "device.ssm.measures": "TTC DRAC",
-        "device.ssm.thresholds": "100 0.0",
-        "device.ssm.range": "150",
-        "device.ssm.extratime": "0",
-        "device.ssm.trajectories": "true",
-        "device.ssm.file": tmp_path / "ssm.xml",
-    }
-    ssm = "".join(f'<param key="{key}" value="{value}"/>' for key, value in given.items())
+    given = {"measures": "TTC DRAC", "thresholds": "100 0.0", "range": "150", "extratime": "0"}
+    given |= {"trajectories": "true", "file": tmp_path / "ssm.xml"}
+    ssm = "".join(f'<param key="device.ssm.{key}" value="{given[key]}"/>' for key in given)
+    ssm += '<param key="has.ssm.device" value="true"/>'
     sumo = road(*NO_GAP, "--precision", "6", ssm=ssm)
     watch = attach(sumo, ["ego"], mode="watch").watching
     measured = []

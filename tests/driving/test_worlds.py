@@ -102,18 +102,11 @@ def test_after_a_run_that_was_closed_from_outside_another_one_starts():
 
 
 IDM_LEADER = IDM(1.2, 25.0, 1.0, 1.0, 2.5)
-FULL = Scenario(
-    Leader(
-        IDM_LEADER,
-        brake_decel=5.0,
-        brake_time=8.0,
-        initial_speed=12.0,
-        waves=((1.0, -2.0), (3.0, 1.5)),
-        cut_in=CutIn(5.0, gap=9.0, speed=11.0),
-    ),
-    initial_gap=20.0,
-    duration=20.0,
-    initial_speed=14.0,
+FULL = Leader(IDM_LEADER, brake_decel=5.0, brake_time=8.0, initial_speed=12.0)
+FULL = replace(FULL, waves=((1.0, -2.0), (3.0, 1.5)), cut_in=CutIn(5.0, gap=9.0, speed=11.0))
+FULL = Scenario(FULL, initial_gap=20.0, initial_speed=14.0, duration=20.0)
+FULL = replace(
+    FULL,
     body=Body(lowest=-6.0, highest=2.0, delay=0.2, jerk=15.0),
     sensors=Sensors(gap_noise=0.5, speed_noise=0.3, delay=0.2, seed=3),
     behind=Behind(IDM(1.25, 25.0, 2.0, 1.0, 2.0, lowest=-8.0), gap=15.0),

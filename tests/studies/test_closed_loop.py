@@ -1,5 +1,7 @@
 """The closed loop on fewer draws."""
 
+from dataclasses import replace
+
 import pytest
 from studies import closed_loop
 from studies.closed_loop import MACHINE, OURS, ClosedLoop
@@ -8,19 +10,8 @@ from evofsm.paper import write_page
 
 # After ten drives a guard was seldom shown to help.
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:this guard was not shown")]
-TINY = ClosedLoop(
-    train=10,
-    test=10,
-    seeds=2,
-    rule_seeds=1,
-    rule_test=3,
-    world_train=10,
-    world_test=2,
-    machine_check=4,
-    machine_train=10,
-    rule_train=4,
-    check_test=10,
-)
+TINY = ClosedLoop(train=10, test=10, seeds=2, rule_seeds=1, rule_train=4, rule_test=3)
+TINY = replace(TINY, world_train=10, world_test=2, machine_train=10, machine_check=4, check_test=10)
 
 
 @pytest.fixture(scope="module")

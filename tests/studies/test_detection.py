@@ -11,18 +11,8 @@ from studies.detection import OURS, PAPER, STATES, Danger, Detection, Exposure, 
 from evofsm.driving import load_family
 from evofsm.paper import write_page
 
-TINY = Detection(
-    train=6,
-    since=3,
-    seeds=2,
-    hours=0.05,
-    rounds=5,
-    seed_hours=0.02,
-    grid=(2.0,),
-    grid_leader=(6.0,),
-    grid_train=4,
-    grid_hours=0.02,
-)
+TINY = Detection(train=6, since=3, seeds=2, hours=0.05, rounds=5, seed_hours=0.02)
+TINY = replace(TINY, grid=(2.0,), grid_leader=(6.0,), grid_train=4, grid_hours=0.02)
 
 
 def cases(truth):
