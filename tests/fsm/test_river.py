@@ -100,17 +100,12 @@ def test_rivers_metrics_of_clusterers_score_it():
     assert RiverClusterer().centers == {}
 
 
-@pytest.mark.parametrize(
-    ("x", "error", "words"),
-    [
-        ({"a": "red"}, TypeError, "feature 'a' is 'red'.*OneHotEncoder"),
-        ({"a": math.inf}, ValueError, "feature 'a' is inf.*finite"),
-    ],
-)
-def test_what_is_no_number_is_named(x, error, words):
+def test_what_is_no_number_is_named():
     clusterer = RiverClusterer(features=("a",))
-    with pytest.raises(error, match=words):
-        clusterer.learn_one(x)
+    with pytest.raises(TypeError, match=r"feature 'a' is 'red'.*OneHotEncoder"):
+        clusterer.learn_one({"a": "red"})
+    with pytest.raises(ValueError, match=r"feature 'a' is inf.*finite"):
+        clusterer.learn_one({"a": math.inf})
     assert clusterer.machine.n_states == 0
 
 

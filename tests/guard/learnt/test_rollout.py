@@ -17,20 +17,12 @@ def mover(choices=0):
     weights = np.zeros((rollout.n_features(1, a, box=not choices), 1))
     weights[ACTION + a - 1] = 1.0
     one, none = np.ones(1), np.zeros(1)
-    return Model(
-        weights=weights,
-        origin=none,
-        reach=one,
-        lowest=-np.inf * one,
-        highest=np.inf * one,
-        least=-9.0 * one,
-        most=9.0 * one,
-        forms=np.array([[FAILS, 0, 0, WALL, WALL, 1.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0]]),
-        dead_ends=np.empty((0, 3)),
-        mean=none,
-        inverse=one,
-        choices=choices,
-    )
+    ends = {"lowest": -np.inf * one, "highest": np.inf * one}
+    ends |= {"least": -9.0 * one, "most": 9.0 * one}
+    units = {"origin": none, "reach": one, "mean": none, "inverse": one}
+    wall = np.array([[FAILS, 0, 0, WALL, WALL, 1.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0]])
+    told = {"forms": wall, "dead_ends": np.empty((0, 3)), "choices": choices}
+    return Model(weights=weights, **ends, **units, **told)
 
 
 def search_for(model, proposal, policies, margin=0.0, place=0.0, residuals=None, allowed=0):
