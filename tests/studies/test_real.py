@@ -180,10 +180,9 @@ def test_the_page_says_what_is_better(folder, rows):
 # -- Leaders --------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def braking(tmp_path_factory):
-    """Leaders who brake [s, m/s²], a pair for each brake; drivers keep the leader's speed."""
-    folder = tmp_path_factory.mktemp("drives")
+@pytest.mark.slow
+def test_hard_brakes_are_counted_by_source_and_waves_once_and_knowledge_quiets_alarms(tmp_path):
+    """Leaders brake [s, m/s²], a pair for each brake; drivers keep the leader's speed."""
     times = np.arange(0.0, 12.0, 0.1)
     for name, brakes in {"a_1": [(3.0, 4.2)], "a_2": [], "b_1": [(3.0, 3.1), (6.0, 2.9)]}.items():
         pairs = []
@@ -191,13 +190,8 @@ def braking(tmp_path_factory):
             v = 25.0 - decel * np.clip(times - begins, 0.0, 2.0)
             did = np.append(np.diff(v) / 0.1, 0.0)
             pairs.append(np.column_stack([times, np.full(len(v), 12.0), v, v, did]))
-        write_run(folder, name, pairs)
-    return folder
-
-
-@pytest.mark.slow
-def test_hard_brakes_are_counted_by_source_and_waves_once_and_knowledge_quiets_alarms(braking):
-    asked = Leaders(data=braking)
+        write_run(tmp_path, name, pairs)
+    asked = Leaders(data=tmp_path)
     found = asked.run(workers=1)
     rows, alarms = found["rows"], found["alarms"]
     assert rows["source"].to_list() == ["a", "b", "all"]
