@@ -176,14 +176,3 @@ def test_sensors_that_take_turns_are_put_together():
     risks = [twin.decide(z, 0.0).risk_proposed for z in (second, first, second, first, second)]
     assert np.isnan(risks).tolist() == [False] * 3 + [True] * 2  # none was whole for long
     assert "lasts longest" in twin.decide(first, 0.0).reason
-
-
-def test_after_a_gap_in_time_no_transition_is_learnt():
-    watch = guard()
-    for time in (0.0, 0.25):
-        watch.decide([30.0, 10.0, 10.0], 0.0, time)
-    before = watch.machine.model().uses.sum()
-    situation = watch.recognise([30.0, 10.0, 10.0], 2.0)
-    assert situation.intake is Intake.GAP
-    assert math.isnan(situation.surprise)
-    assert watch.machine.model().uses.sum() == before

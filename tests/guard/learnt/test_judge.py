@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from evofsm import Guard
-from evofsm.guard import AuditLog, LearntRisk, Mode, Proposal, Situation, audit
+from evofsm.guard import AuditLog, Intake, LearntRisk, Mode, Proposal, Situation, audit
 from evofsm.guard.actions import same_action
 from evofsm.guard.learnt import judge as judging
 from evofsm.guard.learnt.rollout import action_of, search
@@ -379,7 +379,11 @@ def test_after_a_gap_in_time_nothing_follows_from_what_was(points):
     assert (after.executed, after.risk_proposed) == (fresh.executed, fresh.risk_proposed)
     for k in range(20):
         learning.decide([0.01 * k, 0.01], 0.1, time=0.1 * k)
+    uses = learning.machine.model().uses.sum()
     learning.decide([0.9, 0.01], 0.1, time=60.0)
+    assert learning.situation.intake is Intake.GAP
+    assert math.isnan(learning.situation.surprise)
+    assert learning.machine.model().uses.sum() == uses  # no transition either
     assert learning.judge.state.n_episodes == 4
     assert learning.judge.state.most[0] < 0.3  # the leap was not learnt
 
