@@ -114,7 +114,7 @@ def test_what_is_new_is_said_to_be(machine):
         ({"situation": [0.5, 0.9]}, ValueError, "belief"),
         ({"situation": 0, "action": 2}, ValueError, "action is 2"),
         ({}, ValueError, "either a situation or an observation"),
-        ({"situation": 0, "observation": [0.0]}, ValueError, "either a situation or an obs"),
+        ({"situation": 0, "observation": [0]}, ValueError, "either a situation or an observation"),
         ({"observation": [0.0, 1.0]}, ValueError, "z has shape"),
         ({"observation": np.zeros((2, 3))}, ValueError, "2 observations; one"),
     ],
