@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from itertools import product
 from pathlib import Path
+from threading import Thread
 
 import gymnasium
 import numpy as np
@@ -532,6 +533,13 @@ def test_environments_may_share_a_guard_by_turns_and_in_threads(monkeypatch, in_
     order = sorted if in_threads else list
     assert order(guard.judge.episodes) == order(Recorder.ended)
     assert len(Recorder.ended) > 9
+
+
+def test_another_guard_waits_for_nobody():
+    other = Thread(target=RevisedActions(Script(FAR), guard_for(ONE)).reset, daemon=True)
+    env = RevisedActions(Script(FAR), guard_for(ONE), lambda _: other.start() or other.join(9))
+    env.reset()
+    assert not other.is_alive()
 
 
 def test_of_an_episode_amid_which_another_environment_begins_the_rest_is_learnt():

@@ -325,8 +325,6 @@ class Decided(NamedTuple):
 class Lane:
     """The episodes of one environment, or of one agent, under a guard or a twin of a shared one."""
 
-    _lock = RLock()  # threads, an environment each, take turns
-
     def __init__(self, terms: Terms, *, shared: bool, env: Any = None) -> None:
         if shared and terms.guard.audit is not None:
             raise ValueError("an audit log follows one episode at a time; give a guard without one")
@@ -340,6 +338,10 @@ class Lane:
         self.seen: Floats | None = None  #: what the guard observes
         self._mask: Mask | None = None
         self._past: list[tuple[Floats, Proposal, Action]] = []
+
+    @property
+    def _lock(self) -> RLock:  # threads that share a guard, an environment each, take turns
+        return _TURNS.setdefault(self.terms.guard, RLock())
 
     @alone
     def begin(self, observation: Any, info: Mapping[str, Any]) -> None:
@@ -435,8 +437,9 @@ class Lane:
         self._guard, self._past = None, []
 
 
-# Lanes of a guard that began an episode, and guards that lanes were seen to share.
+# Lanes of a guard that began an episode; a lock each; and guards that lanes were seen to share.
 _LANES: WeakKeyDictionary[Guard, WeakSet[Lane]] = WeakKeyDictionary()
+_TURNS: WeakKeyDictionary[Guard, RLock] = WeakKeyDictionary()
 _SHARED: WeakSet[Guard] = WeakSet()
 
 _FAILED = "lambda step: step.info['failed'], lambda step: step.reward <= -100 or 'terminated'"
