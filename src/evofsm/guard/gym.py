@@ -128,9 +128,9 @@ class RevisedActions(_Settled, gymnasium.Wrapper[Any, Any, Any, Any], RecordCons
     Notes
     -----
     A proposal that is kept is passed on untouched. A failure ends the guard's episode; where the
-    environment goes on, proposals pass until ``failed`` says no again, where the next one begins,
-    or in that step, if it puts the last observation in ``info["final_obs"]`` and returns the next
-    episode's. A failure right after nothing was judged is not counted.
+    environment goes on, proposals pass until ``failed`` says no again, where the next one begins.
+    One ends in any step that returns the next one's observation, another than the last, which
+    ``info["final_obs"]`` holds. A failure right after nothing was judged is not counted.
 
     Examples
     --------
@@ -407,11 +407,14 @@ class Lane:
                 self.begin(now.observation, now.info)
             return
         last = [step.info[name] for name in _LAST if step.info.get(name) is not None]
+        if last and not is_over:  # put back at once; or it always tells what it returns
+            seen = [np.array(self.terms.look(z), float) for z in (last[0], now.observation)]
+            is_over = not np.array_equal(*seen, equal_nan=True)
+            last = last if is_over else []
         if last or (is_over and resets):
             info = step.info.get("final_info", step.info)
             step = replace(step, observation=last[0] if last else None, info=info)
         failed = self.terms.failed(step)
-        is_over |= failed and bool(last)  # it was put back at once
         resets = is_over and (resets or bool(last))
         self._score += np.sum(step.reward)
         self._look(step.observation, step.info)
