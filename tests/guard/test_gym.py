@@ -587,7 +587,7 @@ def test_two_loops_that_feed_one_guard_by_turns_are_told():
 
 def test_what_is_learnt_in_another_process_does_not_come_back():
     guard, here = guard_for(Discrete(2)), os.getpid()
-    why = r"a copy, made for another process.*SyncVectorEnv"
+    why = r"a copy \(by deepcopy .*other processes make.*guard.copy\(\).*SyncVectorEnv"
 
     def make():
         with nullcontext() if os.getpid() == here else pytest.warns(UserWarning, match=why):
@@ -602,7 +602,7 @@ def test_what_the_copy_learns_that_gymnasium_makes_does_not_come_back(monkeypatc
     gymnasium.register("Kept-v0", lambda kept: RevisedActions(cart(), kept), kwargs={"kept": guard})
     spec = wrappers.TimeLimit(RevisedActions(cart(), guard), 9).spec
     for name in ("Kept-v0", spec):
-        with pytest.warns(UserWarning, match=r"a copy, .* by gym.make.*wrap those that gym.make"):
+        with pytest.warns(UserWarning, match=r"a copy \(.*gym.make.*wrap those that gym.make"):
             assert gymnasium.make(name).get_wrapper_attr("guard") is not guard
     with warnings.catch_warnings(action="error"):
         warnings.filterwarnings("ignore", message="nobody says which")
@@ -962,6 +962,8 @@ def test_what_hides_agents_from_the_guard_is_named(name):
     if name.endswith("Modifier"):  # as SuperSuit keeps them
         env = pettingzoo.utils.BaseParallelWrapper(Crowd(2))
         env.modifier_class = kind
+    else:  # of one's own
+        env.modifier_class, env.modifier = "fast", 0.5
     with pytest.warns(UserWarning, match=f"{name} below the guard .*that in {name}") as told:
         RevisedAgents(pettingzoo.utils.BaseParallelWrapper(env), guard_for(ONE), failed=bool)
     assert len(told) == 1

@@ -408,8 +408,8 @@ class Lane:
             return
         last = [step.info[name] for name in _LAST if step.info.get(name) is not None]
         if last and not is_over:  # put back at once; or it always tells what it returns
-            seen = [np.array(self.terms.look(z), float) for z in (last[0], now.observation)]
-            is_over = not np.array_equal(*seen, equal_nan=True)
+            there, here = (np.array(self.terms.look(z), float) for z in (last[0], now.observation))
+            is_over = not np.array_equal(there, here, equal_nan=True)
             last = last if is_over else []
         if last or (is_over and resets):
             info = step.info.get("final_info", step.info)
@@ -667,7 +667,8 @@ def _layers(env: Any) -> Iterator[Any]:
 def warn_of(env: Any, guard: Guard, failed: Failed | None) -> None:
     """Name what stands below a guard and keeps it from learning, or others from what it learns."""
     if guard.learn and guard.process != os.getpid():
-        fault = "the guard is a copy, made for another process or by gym.make: it learns for itself"
+        how = "by deepcopy or pickle, as gym.make and other processes make them"
+        fault = f"the guard is a copy ({how}): it learns for itself. If so meant, use guard.copy()"
         hint = "Run the environments in one process (DummyVecEnv, SyncVectorEnv), wrap those that "
         warnings.warn(f"{fault}. {hint}gym.make returns, or save this guard", stacklevel=3)
     if failed is None and guard.failed is None and guard.learn:
@@ -680,7 +681,9 @@ def warn_of(env: Any, guard: Guard, failed: Failed | None) -> None:
     for layer in _layers(env):
         attributes, why = getattr(layer, "__dict__", {}), ""
         # SuperSuit has one wrapper, for each agent's modifier or for the only one.
-        name = attributes.get("modifier_class", type(attributes.get("modifier", layer))).__name__
+        kinds = attributes.get("modifier_class"), type(attributes.get("modifier"))
+        names = [str(getattr(kind, "__name__", "")) for kind in kinds]
+        name = next((n for n in names if n.endswith("Modifier")), type(layer).__name__)
         updates = getattr(layer, "update_running_mean", getattr(layer, "training", True))
         uses_reward = "reward" in getattr(getattr(failed, "__code__", None), "co_names", ())
         if "obs_rms" in attributes and updates:
