@@ -20,7 +20,7 @@ import sys
 import tempfile
 import zipfile
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
@@ -110,12 +110,15 @@ def write_fmu(guard: Guard, file: Path) -> None:
             (folder / file_name).write_text(text, "utf-8")
         files = [folder / part for part in (library, "evofsm.c", "fmi2.c")]
         compiler, fault = os.environ.get("CC") or "cc", "it cannot be started"
-        with suppress(OSError, ValueError):
+        try:
             words = [compiler] if shutil.which(compiler) else shlex.split(compiler)
             code = subprocess.run([*words, *_FLAGS, "-o", *files, "-lm"], check=False).returncode
-            fault = f"it ended with status {code}"
-            ctypes.CDLL(str(files[0]))
-            fault = ""
+            fault = f"it ended with status {code}" if code else ""
+            if not fault:
+                ctypes.CDLL(str(files[0]))
+        except (OSError, ValueError) as error:
+            if not fault and "not permitted" not in str(error):  # only here, if mounted noexec
+                fault = str(error).removeprefix(f"{files[0]}: ")
         with zipfile.ZipFile(output, "w", zipfile.ZIP_DEFLATED) as unit:
             unit.write(folder / "modelDescription.xml", "modelDescription.xml")
             for file_name in ("evofsm.h", "evofsm.c", "fmi2.c"):
