@@ -290,6 +290,7 @@ def test_streams_that_are_closed_or_do_not_wait_end_it_in_a_line_or_not_at_all()
     program = shlex.join([sys.executable, "-m", "evofsm"])
     base, another = f"{program} monitor", f"{program} check evofsm.fsm:Novelty"
     closed = {f"{base} <&-": "input", f"{base} >&-": "output", f"{another} >&-": "output"}
+    closed |= {f"{program} --{option} >&-": "output" for option in ("version", "help")}
     for command, name in closed.items():
         done = subprocess.run(command, shell=True, capture_output=True, text=True)
         assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)

@@ -79,7 +79,7 @@ def _print_version(asked: bool) -> None:
     if asked:
         from evofsm import __version__
 
-        print(f"evofsm {__version__}")
+        print(f"evofsm {__version__}", flush=True)
         raise typer.Exit
 
 
@@ -119,4 +119,10 @@ def run(make: Callable[[], typer.Typer]) -> None:
 
         announce_compiling()
     warnings.showwarning = _say
-    make()()
+    try:
+        make()()
+    except OSError as error:  # of --help and --version; commands say so themselves
+        from evofsm.cli.show import warn
+
+        warn(_message(error))
+        sys.exit(2)
