@@ -12,6 +12,9 @@ from evofsm import EvolvingFSM
 pytestmark = pytest.mark.usefixtures("compiled")
 
 
+OWN = "own.py, line 3, in <lambda>: ZeroDivisionError: division by zero"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "fault", "may", "why"),
@@ -19,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("compiled")
         (["paper", "--learn-first", "3"], "", "steer the run", ""),
         (["log.csv"], "", "look on", ""),
         (["own.py", "--learn-first", "0"], "time.sleep(600)", "steer the run", ""),
-        (["own.py", "--learn-first", "0"], "1 / 0", "", "ZeroDivisionError: division by zero"),
+        (["own.py", "--learn-first", "0"], "1 / 0", "", OWN),
     ],
 )
 def test_it_prints_an_address_that_answers_and_control_c_ends_what_goes_on_hangs_or_broke_off(
