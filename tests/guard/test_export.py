@@ -298,10 +298,8 @@ def test_what_a_compiler_does_not_build_for_here_is_no_part_of_an_fmu(
     assert fmpy.supported_platforms(tmp_path / "wall.fmu") == ["c-code"]
     text = f"holds sources alone: {compiler} (CC, or cc) built no library that loads here: {why}"
     assert text in caplog.text
-
-
-def test_a_library_that_may_not_be_loaded_from_that_folder_is_kept(wall, monkeypatch, tmp_path):
-    no = OSError("x.so: failed to map segment from shared object: Operation not permitted")
+    monkeypatch.setenv("CC", "cc")
+    no = OSError("failed to map segment: Operation not permitted")  # under noexec
     monkeypatch.setattr("ctypes.CDLL", lambda _: (_ for _ in ()).throw(no))
     write_fmu(wall.guard, tmp_path / "wall.fmu")
     assert len(fmpy.supported_platforms(tmp_path / "wall.fmu")) == 2

@@ -482,20 +482,16 @@ def test_episodes_that_an_environment_begins_by_itself_are_learnt(monkeypatch, w
     assert ["reset()" in str(one.message) for one in heard] == [True] * (wrap is Again and not name)
 
 
-@pytest.mark.parametrize(
-    ("name", "fails", "tells"),
-    [*((name, True, False) for name in NAMES), ("final_obs", False, True)],
-)
-def test_what_is_put_back_at_once_ended_where_it_was_and_begins_an_episode(name, fails, tells):
+@pytest.mark.parametrize(("name", "fails"), [*product(NAMES, [True]), ("final_obs", False)])
+def test_what_is_put_back_at_once_ended_where_it_was_and_begins_an_episode(name, fails):
     class Back(Script):
         def step(self, action):
             seen, *said, info = super().step(action)
-            info |= {name: seen} if tells or seen is HIT else {}
+            info |= {name: seen} if seen is HIT or not fails else {}
             return FAR if seen is HIT else seen, *said, info
 
     env = Back(NEAR, HIT, NEAR)
-    failed = lambda step: fails and step.observation[0] < 0.0  # noqa: E731
-    env = RevisedActions(env, guard_for(ONE), failed=failed)
+    env = RevisedActions(env, guard_for(ONE), failed=lambda step: fails and step.observation[0] < 0)
     drive(env, lambda *_: np.array([0.0]))
     rows = [([(tuple(seen), (0.0,))], tuple(last)) for seen, last in ((NEAR, HIT), (FAR, NEAR))]
     assert env.guard.judge.episodes == [(*rows[0], fails), (*rows[1], False)]

@@ -122,7 +122,5 @@ def run(make: Callable[[], typer.Typer]) -> None:
     try:
         make()()
     except OSError as error:  # of --help and --version; commands say so themselves
-        from evofsm.cli.show import warn
-
-        warn(_message(error))
+        print(f"evofsm: {_message(error)}", file=sys.stderr)
         sys.exit(2)

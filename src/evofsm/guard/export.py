@@ -114,8 +114,7 @@ def write_fmu(guard: Guard, file: Path) -> None:
             words = [compiler] if shutil.which(compiler) else shlex.split(compiler)
             code = subprocess.run([*words, *_FLAGS, "-o", *files, "-lm"], check=False).returncode
             fault = f"it ended with status {code}" if code else ""
-            if not fault:
-                ctypes.CDLL(str(files[0]))
+            _ = fault or ctypes.CDLL(str(files[0]))
         except (OSError, ValueError) as error:
             if not fault and "not permitted" not in str(error):  # only here, if mounted noexec
                 fault = str(error).removeprefix(f"{files[0]}: ")

@@ -118,7 +118,12 @@ class Player:
                 self._go_on()
             except Exception as error:
                 # Whoever looks on must learn why nothing moves any more.
-                self.fault, self._over = f"{_place(error)}{type(error).__name__}: {error}", True
+                text = f"{type(error).__name__}: {error}"
+                for step, line in walk_tb(error.__traceback__):
+                    if step.f_globals.get("__name__") == "<run_path>":  # a file of one's own
+                        place = f"{step.f_code.co_filename}, line {line}, in {step.f_code.co_name}"
+                        text = f"{place}: {type(error).__name__}: {error}"
+                self.fault, self._over = text, True
                 warn(f"the run broke off: {self.fault}")
                 self._audience("clock", self._clock())
                 self._audience("failed", self.fault)
@@ -171,13 +176,6 @@ class Player:
 
     def _clock(self) -> Clock:
         return Clock(self._paused, self._speed, self._revising, self._over)
-
-
-def _place(error: BaseException) -> str:
-    """Where in a file of one's own it was, if in any."""
-    name, steps = "<run_path>", walk_tb(error.__traceback__)
-    own = [(step.f_code, line) for step, line in steps if step.f_globals.get("__name__") == name]
-    return "".join(f"{c.co_filename}, line {line}, in {c.co_name}: " for c, line in own[-1:])
 
 
 def message(kind: str, what: Any, start: Start | None = None) -> str:
