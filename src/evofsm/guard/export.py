@@ -116,7 +116,7 @@ def write_fmu(guard: Guard, file: Path) -> None:
             fault = f"it ended with status {code}" if code else ""
             _ = fault or ctypes.CDLL(str(files[0]))
         except (OSError, ValueError) as error:
-            if not fault and "not permitted" not in str(error):  # only here, if mounted noexec
+            if not fault and not re.search("to map|not permitted", str(error)):  # under noexec
                 fault = str(error).removeprefix(f"{files[0]}: ")
         with zipfile.ZipFile(output, "w", zipfile.ZIP_DEFLATED) as unit:
             unit.write(folder / "modelDescription.xml", "modelDescription.xml")
