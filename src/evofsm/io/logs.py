@@ -815,6 +815,9 @@ class _Reader:
                 starts, reports = self._between(starts, *signals)
                 piece, times = piece.take(signals[0]), times[signals[0]]
             if not piece.rows:
+                if reports[0] and self._kept and last_chunk is not None:  # of the latest row
+                    last_chunk.fails[-1] = self._held = self._ended = True
+                    self._noted.failing += 1
                 continue
             anew, late, holes = starts.copy(), *np.zeros((2, piece.rows), np.bool_)
             if not self._columns.longest_hole:
