@@ -251,15 +251,18 @@ def test_an_action_may_be_mapped_and_failures_be_told_of_by_a_comparison(tmp_pat
     assert np.flatnonzero(chunk.fails).tolist() == [len(chunk.times) - 1]
 
 
-def test_what_a_recorder_that_was_killed_left_beside_its_file_is_read(tmp_path):
+@pytest.mark.parametrize("left", ["", "-shm"])
+def test_what_a_recorder_that_was_killed_left_beside_its_file_is_read(tmp_path, left):
     (file,) = Path(write(tmp_path / "bag", drive())).glob("*.db3")
     with closing(sqlite3.connect(file)) as bag:  # as rosbag2's storage preset "resilient"
         bag.execute("PRAGMA journal_mode=wal")
         bag.execute("DELETE FROM messages WHERE timestamp > ?", (101 * SECOND,))
         bag.commit()
-        for part in tmp_path.glob("bag/*.db3*"):
-            shutil.copy(part, tmp_path)
+        for ending in {"", "-wal", left}:
+            shutil.copy(f"{file}{ending}", tmp_path)
+    there = {*tmp_path.iterdir()}
     assert read(str(tmp_path / file.name))[0].times[-1] == pytest.approx(1.0)
+    assert {*tmp_path.iterdir()} == there
 
 
 def test_a_bag_that_is_damaged_says_so(tmp_path):

@@ -18,6 +18,7 @@ from functools import partial
 from itertools import chain
 from os import PathLike
 from pathlib import Path
+from shutil import copyfile
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
@@ -379,6 +380,11 @@ def _files(path: Path) -> Iterator[tuple[Path, bool]]:
                 with file.open("rb") as source, target.open("wb") as out:
                     zstandard.ZstdDecompressor().copy_stream(source, out)
                 file = target
+            log, index = Path(f"{file}-wal"), Path(f"{file}-shm")
+            if log.is_file() and log.stat().st_size and not index.exists():
+                # No recorder runs; SQLite would write an index beside the file, if it may.
+                copyfile(log, Path(folder) / log.name)
+                file = Path(copyfile(file, Path(folder) / file.name))
             with file.open("rb") as stream:
                 yield file, stream.read(len(_MCAP)) == _MCAP
 
