@@ -206,14 +206,18 @@ def test_who_is_beside_is_nobody_s_leader_in_fcd(tmp_path, told, ending):
 
 
 @pytest.mark.parametrize("told", [(), ("posLat",)])
-def test_who_parks_beside_the_road_is_nobody_s_leader_until_it_is_back(tmp_path, told):
+@pytest.mark.parametrize("speed", [0.5, 0.0])
+def test_who_parks_beside_the_road_is_nobody_s_leader_until_it_is_back(tmp_path, told, speed):
     road = {}
     for k, y in enumerate([0.0, 3.2, 3.2, 3.2, 3.2, 0.0, 0.0]):
-        x = 10.0 + 20 * k
-        road[k] = ("van", "e", 100.0, 0.0, 100.0, y, 0.0), ("car", "e", x, 20.0, x, 0.0, 0.0)
+        x, v = 10.0 + 20 * k, 0.0 if k else speed
+        road[k] = ("van", "e", 100.0, v, 100.0, y, 0.0), ("car", "e", x, 20.0, x, 0.0, 0.0)
     found = episodes(write(tmp_path / "a.xml", xml(road, (*FIELDS[:4], "x", "y", *told))))
+    if not speed:  # where the road is, nobody knows
+        assert found[-1][2][-1] == 6.0
+        return
     assert [(times.tolist(), rows[0].tolist()) for rows, _, times in found] == [
-        ([0.0], [85.0, 20.0, 0.0]),
+        ([0.0], [85.0, 20.0, speed]),
         ([5.0, 6.0], [5.0, 0.0, 20.0]),
     ]
 

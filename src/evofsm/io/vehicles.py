@@ -71,8 +71,8 @@ class Vehicle(NamedTuple):
 
 #: Time [s], where it stands, and all that is there then: where, and what stands there by its name.
 Moment = tuple[float, Place, list[tuple[Place, Mapping[str, Any]]]]
-#: Where a vehicle was: its heading, lanes and places in the plane and along; whether it parks.
-_Track = tuple[complex, Sequence[str], complex, float, bool]
+#: A vehicle's heading, and where it was on the road: its lanes, places in the plane and along.
+_Track = tuple[complex, Sequence[str], complex, float]
 _Pair = tuple[str, str]  #: follower and leader, on whichever lane
 
 
@@ -159,14 +159,16 @@ class PairTable(Table):
                 self.skips.leave_out("twice", why)
                 continue
             names.add(car.name)
-            here = car.heading, car.lanes, car.place, car.along, False
-            heading, ways, place, along, parks = tracks.get(car.name, here)
+            here = car.lanes, car.place, car.along
+            heading, ways, place, along = tracks.get(car.name, (car.heading, (), *here[1:]))
             if car.heading != car.heading:
                 car = car._replace(heading=heading)
+            drives = not car.speed < _TURNS_ABOVE
             aside = abs(car.place - place) - 2.0 * abs(car.along - along)
-            jumps = aside > _USUAL_WIDTH and car.lanes == ways
-            parks = car.speed < _TURNS_ABOVE and parks != jumps
-            tracks[car.name] = car.heading, *here[1:4], parks
+            parks = not drives and car.lanes == ways and aside > _USUAL_WIDTH
+            # Who was never seen to drive on a lane may have been beside it from the first.
+            is_known = drives or (car.lanes == ways and not parks)
+            tracks[car.name] = car.heading, *(here if is_known else (ways, place, along))
             for lane in dict.fromkeys(() if parks else car.lanes):
                 lanes[lane].append(car)
         return [lanes[name] for name in sorted(lanes)] if self.lengths else lanes.values()
