@@ -203,6 +203,7 @@ def test_episodes_that_come_back_are_refused_with_the_remedy(tmp_path, pieces):
         (b"\xef\xbb\xbf\n \n", "is empty"),
         (gzip.compress(b"", mtime=0), "is empty"),
         (HEADER.encode(), "has a header but no rows"),
+        ("# é\n".encode("latin1") + f"# ääää\n{HEADER}\n".encode(), "header but no rows"),
         (b"# drive 7\n0,1\n1,2\n", "line 2: '0,1' is no header"),
         (b"# drive\n" * 200 + b"x,y\n# 1\n", "has no column 'gap'; it has x, y"),
         (b'# "x, m";y\n0;1\n1;2\n', "no column 'gap'; it has \"x, m\", y"),
@@ -538,6 +539,12 @@ def test_decimal_commas_are_known_by_one_that_parts_no_thousands(tmp_path, sign,
     header = "time gap v_follower v_leader a_follower".replace(" ", sign)
     path = write(tmp_path / "a.csv", [row.replace(" ", sign) for row in rows], header)
     assert together(path)[0] == [float(gap.replace(",", ".")) for gap in gaps]
+
+
+def test_a_number_may_name_a_column_and_a_text_has_no_decimal_commas(tmp_path):
+    lines = ["time\tgap\t1\tlanes", "0.1\t1,234\t2\ta", "0.2\t5\t3\t1,2"]
+    table = CsvTable(write(tmp_path / "a.csv", lines, "rig\tx\ty\tz"), ["time", "gap"])
+    assert (list(table.columns), table.holds("gap")) == (["time", "gap", "1", "lanes"], "text")
 
 
 @pytest.mark.parametrize("odd", ["", ";;;;"])

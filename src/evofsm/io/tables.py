@@ -14,7 +14,7 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
-from itertools import chain
+from itertools import chain, zip_longest
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, NoReturn
 
 import numpy as np
@@ -174,7 +174,7 @@ class Skips:
 
     def refuse_nothing(self, otherwise: str) -> NoReturn:
         """Raise where no row is left, for what was left out first."""
-        faults = (first for kind, first in self.first.items() if kind != "comment")
+        faults = (first for kind, first in self.first.items() if kind not in ("comment", "letter"))
         raise ValueError(next(faults, otherwise))
 
 
@@ -478,13 +478,25 @@ class Dialect:
         if self.n_told:
             self.units, rows = dict(zip(self.columns, units, strict=False)), rows[self.n_told :]
         self.first_row = rows[0] if rows else []
-        commas = map(_DECIMAL_COMMA.fullmatch, [t for row in rows for t in row])
-        self.has_commas = self.separator == ";" or (self.separator in "\t|" and any(commas))
+        self.has_commas = self.separator == ";"
+        if self.separator in "\t|":
+            self.has_commas = _has_decimal_commas(zip_longest(*rows, fillvalue=""))
 
     def miscounted(self, count: int, named: int) -> str:
         """What is wrong with a line of so many fields."""
         why = f"(cut off, a quote not closed, or does a field hold {self.separator!r}?)"
         return f"{count} fields, but the header names {named} {why}"
+
+
+def _has_decimal_commas(columns: Iterable[Iterable[str]]) -> bool:
+    """Whether columns of numbers have them, by one that parts no thousands."""
+    commas, points = list[bool](), False
+    for column in columns:
+        fields = [text for text in column if text.strip().lower() not in MISSING]
+        if 2 * sum(is_number(text.replace(",", ".")) for text in fields) > len(fields):
+            commas += [bool(_DECIMAL_COMMA.fullmatch(text)) for text in fields if "," in text]
+            points |= any("." in text and "," not in text for text in fields)
+    return all(commas) if commas and points else any(commas)  # where points are decimal, of all
 
 
 class CsvTable(Table):
@@ -521,9 +533,10 @@ class CsvTable(Table):
     def _header(self, lines: Sequence[str], names: set[str]) -> int:
         """Which line names the columns: the one with most names, or the last before the rows."""
         headers = [Dialect(line, ()).columns for line in lines]
-        there = [len(names & {*line}) * (not any(map(is_value, line))) for line in headers]
-        if any(there):
-            return there.index(max(there))
+        there = [(len(names & {*line}), sum(map(is_value, line))) for line in headers]
+        named = [has * (has >= values) for has, values in there]  # a number may name a column, too
+        if any(named):
+            return named.index(max(named))
         rows = [at for at, line in enumerate(lines) if line.strip() and not _COMMENT.match(line)]
         rows = [at for at in rows if not lines[at].startswith("sep=")]
         counts = [sum(map(bool, headers[at])) for at in rows], [len(headers[at]) for at in rows]
