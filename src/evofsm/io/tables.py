@@ -534,9 +534,9 @@ class CsvTable(Table):
         """Which line names the columns: the one with most names, or the last before the rows."""
         headers = [Dialect(line, ()).columns for line in lines]
         there = [(len(names & {*line}), sum(map(is_value, line))) for line in headers]
-        named = [has * (has >= values) for has, values in there]  # a number may name a column, too
-        if any(named):
-            return named.index(max(named))
+        scores = [has * (has >= values) for has, values in there]  # a number may name a column, too
+        if any(scores):
+            return scores.index(max(scores))
         rows = [at for at, line in enumerate(lines) if line.strip() and not _COMMENT.match(line)]
         rows = [at for at in rows if not lines[at].startswith("sep=")]
         counts = [sum(map(bool, headers[at])) for at in rows], [len(headers[at]) for at in rows]
