@@ -345,6 +345,10 @@ def test_a_model_that_under_a_limit_drives_a_little_slower_than_it_says_is_no_sc
 def test_what_a_car_can_do_is_asked_anew_as_on_a_wet_road(road):
     guards = attach(sumo := road(*NO_GAP), ["ego"])
     drive(sumo, 5.0)
+    guard = guards.guarding.cars["ego"].guard
+    sumo.vehicle.setMinGap("ego", 0.6)  # of no concern to it
+    drive(sumo, 0.1)
+    assert guards.guarding.cars["ego"].guard is guard
     sumo.vehicle.setDecel("ego", 1.5)
     sumo.vehicle.setEmergencyDecel("ego", 1.5)
     for _ in range(20):
@@ -352,6 +356,18 @@ def test_what_a_car_can_do_is_asked_anew_as_on_a_wet_road(road):
     speeds = np.array([before, *drive(sumo, 13.0, brakes_at=8.0)])
     assert np.diff(speeds).min() >= -0.1501
     assert guards.guarding.overruled == 0
+
+
+def test_what_its_leader_can_do_is_asked_anew(road):
+    sumo = road(*NO_GAP)
+    sumo.vehicle.setDecel("lead", 1.0)
+    sumo.vehicle.setEmergencyDecel("ego", 4.5)
+    guards = attach(sumo, ["ego"])
+    drive(sumo, 5.0)
+    sumo.vehicle.setDecel("lead", 8.0)
+    drive(sumo, 20.0)
+    assert not guards.collisions
+    assert [len(guards.guarding.leaders[decel]) for decel in (1.0, 8.0)] == [0, 1]
 
 
 def test_whoever_is_of_the_type_now_is_guarded_and_who_is_not_is_not(road):

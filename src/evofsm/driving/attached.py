@@ -102,6 +102,11 @@ class _Facts(NamedTuple):
     tau: float  #: [s]
     late: bool  #: whether it decides less often than in each step, and than its ``tau``
 
+    @property
+    def strength(self) -> tuple[float, float, float]:
+        """What a guard counts on: its ``decel``, hardest braking and ``accel``."""
+        return self.decel, self.hardest, self.accel
+
 
 class Seeing:
     """Reads the cars around one of them, by libsumo or traci."""
@@ -238,8 +243,7 @@ class GuardedStep(NamedTuple):
 class _Car:
     id: str
     guard: Guard
-    high: float  # the hardest acceleration
-    body: _Facts  # that the guard counts on
+    body: _Facts
     mode: int | None = None  # SUMO's speed mode before it was taken over
     speed: float = 0.0
     limit: float = 0.0  # the speed that was set
@@ -250,6 +254,12 @@ class _Car:
     around: tuple[Neighbour | None, Neighbour | None] = (None, None)
     revision: Revision | None = None
     about: tuple[str, Role | None] = ("", None)
+
+    @property
+    def high(self) -> float:
+        """The hardest acceleration; what a guard cannot allow either way it does not forbid."""
+        high: Any = self.guard.actions.high
+        return float(min(self.body.accel, high))
 
 
 def _no_simulation(sumo: Any) -> type[Exception]:
@@ -314,7 +324,8 @@ class Guarding:
 
     def add(self, car: str) -> None:
         """Guard it from now on."""
-        self.cars[car] = _Car(car, *self._guard_for(self._seeing.body(car)))
+        body = self._seeing.body(car)
+        self.cars[car] = _Car(car, self._guard_for(body), body)
 
     def remove(self, car: str) -> None:
         """Guard it no longer: it is handed back."""
@@ -343,9 +354,9 @@ class Guarding:
 
     def _look(self, car: _Car, speed: float) -> None:
         """See what is around; without anybody, a guard of one leader has nothing to decide on."""
-        if (body := self._seeing.body(car.id)) != car.body:  # as on a wet road
-            car.guard, car.high, car.body = self._guard_for(body)
-            car.around = None, None
+        body, car.body = car.body, self._seeing.body(car.id)
+        if self._template is None and car.body.strength != body.strength:  # as on a wet road
+            car.guard, car.around = self._guard_for(car.body), (None, None)
         ahead, before = self._seeing.neighbour(car.id, speed), car.around[0]
         scene = isinstance(judge := _judge(car.guard), TrafficRisk)
         # Who is behind matters only where one brakes: if acting, because somebody is ahead.
@@ -354,8 +365,8 @@ class Guarding:
         car.around = ahead, behind
         if (ahead and ahead.id) != (before and before.id):
             car.guard.begin()  # what is known of the one before does not hold of this one
-            if ahead and self._template is None and isinstance(judge, TrafficRisk):
-                judge.ahead.manoeuvres = self._leaders_like(ahead.id)
+        if ahead and self._template is None and isinstance(judge, TrafficRisk):
+            judge.ahead.manoeuvres = self._leaders_like(ahead.id)  # its brakes may have changed
         car.revision = car.seen = None
         if scene and (ahead or behind):
             car.seen = self._seeing.rows(car.id, speed, ahead, behind)
@@ -463,14 +474,17 @@ class Guarding:
         for car in chain.from_iterable(group.cars for group in groups if group._acts):
             speeds.pop(car, None)
             self._watches.pop(car, None)
+        arrivals = self._sumo.simulation.getDepartedIDList()  # maybe with the name of one before
+        now = {leader: self._leaders_like(leader) for leader in speeds}
+        for leader, (watch, brakes) in sorted(self._watches.items()):
+            if now.get(leader) is not brakes or leader in arrivals:
+                brakes.remember(watch.end())
+                del self._watches[leader]
         for leader, speed in speeds.items():
             if leader not in self._watches:
-                self._watches[leader] = BrakeWatch(self.interval), self._leaders_like(leader)
+                self._watches[leader] = BrakeWatch(self.interval), now[leader]
             watch, brakes = self._watches[leader]
             brakes.remember(watch.see(0.0, speed, speed))
-        for leader in sorted(self._watches.keys() - speeds.keys()):
-            watch, brakes = self._watches.pop(leader)
-            brakes.remember(watch.end())
 
     def _leaders_like(self, car: str) -> Manoeuvres:
         """What is known of leaders that brake as hard as it, by what SUMO says of them."""
@@ -479,17 +493,14 @@ class Guarding:
             self.leaders[decel] = Manoeuvres(decel, width=_SEEN_TO)
         return self.leaders[decel]
 
-    def _guard_for(self, body: _Facts) -> tuple[Guard, float, _Facts]:
+    def _guard_for(self, body: _Facts) -> Guard:
         if self._template is None:
-            guard = self._given(body.decel, body.hardest, body.accel)
-        else:
-            guard = self._template.copy()
-            guard.freeze()
-            if isinstance(guard.reviser, ActionReviser):
-                guard.reviser.mode = self._mode
-        high: Any = guard.actions.high
-        # What a guard cannot allow either way it does not forbid.
-        return guard, min(body.accel, high), body
+            return self._given(*body.strength)
+        guard = self._template.copy()
+        guard.freeze()
+        if isinstance(guard.reviser, ActionReviser):
+            guard.reviser.mode = self._mode
+        return guard
 
     def _given(self, decel: float, hardest: float, high: float) -> Guard:
         """A guard that counts on one braking, of leaders too, and brakes harder if it has to."""
