@@ -165,8 +165,7 @@ def test_of_a_car_in_which_a_guard_acts_nothing_is_learnt(road, mode, vehicles):
 
 
 def test_where_sumo_says_0_of_whatever_is_nearer_than_min_gap_the_car_stops(road):
-    sumo = road(*NO_GAP)
-    guards = attach(sumo, ["ego"])
+    guards = attach(sumo := road(*NO_GAP), ["ego"])
     drive(sumo, 1.0)
     guards._seeing._vehicle = SimpleNamespace(**vars(sumo.vehicle))
     guards._seeing._vehicle.getLeader = lambda car, _: ("lead", 0.0)  # as at a junction
@@ -174,8 +173,7 @@ def test_where_sumo_says_0_of_whatever_is_nearer_than_min_gap_the_car_stops(road
 
 
 def test_a_car_is_taken_over_only_where_it_has_to_be_and_handed_back(road):
-    sumo = road(*NO_GAP)
-    guards = attach(sumo, ["ego"])
+    guards = attach(sumo := road(*NO_GAP), ["ego"])
     modes = [31]  # as SUMO has it
     while modes[-1] == 31:
         drive(sumo, 0.1)
@@ -223,8 +221,7 @@ OWN = {
 
 @pytest.mark.parametrize("mine", OWN.values(), ids=OWN)
 def test_a_guard_of_ones_own_is_copied_and_left_as_it_was(road, mine):
-    sumo = road(*NO_GAP)
-    guards = attach(sumo, ["ego"], guard=mine)
+    guards = attach(sumo := road(*NO_GAP), ["ego"], guard=mine)
     drive(sumo, 25.0)
     assert guards.collisions == []
     assert guards.guarding.decisions <= 25.0 / mine.interval
@@ -295,9 +292,13 @@ def test_who_detaches_after_the_end_is_rid_of_the_guards(road):
 def test_where_sumo_looks_for_no_collisions_none_is_counted(road):
     sumo = road(*NO_GAP)
     sumo.load(["none" if option == "warn" else option for option in road.options])
-    with pytest.warns(RuntimeWarning, match="looks for no collisions"):
+    with pytest.warns(RuntimeWarning, match="looks for no collisions") as told:
         watch = attach(sumo, ["ego"], mode="watch")
+    assert told[0].filename == __file__
     drive(sumo, 25.0)
+    sumo.load(road.options)  # in this one it does
+    with pytest.warns(RuntimeWarning, match="another simulation"):
+        drive(sumo, 1.0)
     assert np.isnan(watch.summary()["collisions"])
 
 
@@ -407,8 +408,7 @@ def test_a_car_that_sumo_teleports_begins_anew(tmp_path):
 
 
 def test_a_car_that_a_script_stops_stays_stopped_until_the_script_lets_it_go(road):
-    sumo = road(*NO_GAP)
-    guards = attach(sumo, ["ego"])
+    guards = attach(sumo := road(*NO_GAP), ["ego"])
     while sumo.vehicle.getSpeedMode("ego") == 31:
         drive(sumo, 0.1)
     sumo.vehicle.setSpeed("ego", 0.0)
@@ -449,8 +449,7 @@ def test_sumo_as_referee_measures_the_same(road, tmp_path):
 
 
 def test_who_comes_towards_one_is_measured_with_a_negative_speed(road):
-    sumo = road(*NO_GAP)
-    watch = attach(sumo, ["ego"], mode="watch").watching
+    watch = attach(sumo := road(*NO_GAP), ["ego"], mode="watch").watching
     angles = {"ego": 90.0, "lead": 270.0}  # as it overtakes on the oncoming lane
     watch._seeing._vehicle = SimpleNamespace(**vars(sumo.vehicle) | {"getAngle": angles.get})
     drive(sumo, 1.0)

@@ -129,8 +129,6 @@ class Seeing:
             raise ValueError(_MESOSCOPIC)
         #: Whether SUMO looks for collisions.
         self.counts = str(simulation.getOption("collision.action")) != "none"
-        if not self.counts:
-            warnings.warn(_UNCOUNTED, RuntimeWarning, stacklevel=5)
         factor = float(simulation.getOption("collision.mingap-factor"))
         # Share of minGap that SUMO wants kept; below 0 each model has its own, at most all of it.
         self._factor = factor if factor >= 0.0 else 1.0
@@ -629,6 +627,7 @@ class Attachment:
         self.looked = 0  #: cars that were looked at, summed over the steps
         self._ride = _Ride(seeing.dt)
         self.seconds = 0.0  #: that the attachment took
+        self._counts = seeing.counts  # in each simulation until now
 
     @property
     def cars(self) -> list[str]:
@@ -680,6 +679,8 @@ class Attachment:
         if self._is_new():
             warnings.warn(_ANOTHER, RuntimeWarning, stacklevel=2)
             self._begin_anew()
+            if not self._seeing.counts:
+                warnings.warn(_UNCOUNTED, RuntimeWarning, stacklevel=2)
             self._sumo.simulation.setParameter("", self._key, "1")
         elif before is not None and abs(now - before - self._seeing.dt) > _TICK:
             if now - before > self._seeing.dt:
@@ -724,7 +725,7 @@ class Attachment:
             "jerk": math.sqrt(ride.jerks / seconds),
             "time_lost": ride.lost,
         }
-        if not self._seeing.counts:
+        if not self._counts:
             numbers |= dict.fromkeys(("collisions", "of_guarded", "into_guarded"), math.nan)
         if guards is not None and guards.decisions:
             numbers |= {name: getattr(guards, name) for name in ("decisions", "limited", "revised")}
@@ -745,6 +746,7 @@ class Attachment:
         self._known.clear()
         self._met.clear()
         self._seeing.look_up()
+        self._counts = self._counts and self._seeing.counts
         if self.guarding is not None:
             self.guarding.begin_anew()
 
@@ -826,7 +828,8 @@ def attach(
     while that shows. Where you set a car's speed yourself, ask a `Guard` before you do instead.
     After ``load``, or ``close`` and ``start`` of libsumo, an attachment goes on with the new cars,
     and what it counts goes on, as a warning says; ``detach`` ends it, and so does whoever attaches
-    anew. With ``--collision.action none`` SUMO looks for no collisions, and their numbers are NaN.
+    anew. With ``--collision.action none``, in any of them, SUMO looks for no collisions, and their
+    numbers are NaN.
 
     Examples
     --------
@@ -849,5 +852,7 @@ def attach(
         cars = Guarding(sumo, sight, guard, mode == "act", tolerance, regain, report)
     by_type = isinstance(vehicles, str) and vehicles.startswith(_TYPE)
     attachment = Attachment(sumo, is_chosen, sight, cars, by_type)
+    if not sight.counts:
+        warnings.warn(_UNCOUNTED, RuntimeWarning, stacklevel=2)
     attachment.listen()
     return attachment
