@@ -1,4 +1,4 @@
-"""A SUMO script of one's own, with three lines more: of evofsm, and of ``guards``."""
+"""A SUMO script of one's own, with four lines more: import, attach, print and detach."""
 
 import libsumo
 

@@ -481,7 +481,7 @@ def test_what_cannot_be_is_refused(road, options, given, said):
 
 IDS = [str(k) for k in range(2000)]
 OF_BUSES = {"7": "bus", "8": "bus@8"}  # of which a script changed one
-TYPES = SimpleNamespace(vehicle=SimpleNamespace(getTypeID=lambda car: OF_BUSES.get(car, "x")))
+TYPES = SimpleNamespace(kind=lambda car: OF_BUSES.get(car, "x"))
 
 
 def chosen(vehicles):

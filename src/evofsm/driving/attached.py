@@ -155,10 +155,13 @@ class Seeing:
         if self._vehicle.getActionStepLength(car) > self.dt + _TICK:
             self.euler = 0.0
 
+    def kind(self, car: str) -> str:
+        """Its type; what a script changes of one car makes that a type of its own."""
+        return self._types.get(car) or self._types.setdefault(car, self._vehicle.getTypeID(car))
+
     def body(self, car: str) -> _Facts:
-        """Of a car, by its type; what a script changes of one car makes that a type of its own."""
-        kind = self._types.get(car) or self._types.setdefault(car, self._vehicle.getTypeID(car))
-        if kind not in self._bodies:
+        """Of a car, by its type."""
+        if (kind := self.kind(car)) not in self._bodies:
             of = self._type
             decel, tau = of.getDecel(kind), of.getTau(kind)
             late = of.getActionStepLength(kind) > max(self.dt, tau) + _TICK
@@ -516,11 +519,11 @@ def _judge(guard: Guard) -> ActionJudge | None:
 def choose(vehicles: str | float | Iterable[str]) -> Callable[[Any, str], bool]:
     """A test of whether a vehicle is one of those that are meant, the same in every run."""
     if isinstance(vehicles, str) and vehicles == "all":
-        return lambda sumo, car: True
+        return lambda seeing, car: True
     if isinstance(vehicles, str) and vehicles.startswith(_TYPE):
         kind = vehicles.removeprefix(_TYPE)
         # A type of which a script changed anything for one car is called NAME@car.
-        return lambda sumo, car: f"{sumo.vehicle.getTypeID(car)}@".startswith(f"{kind}@")
+        return lambda seeing, car: f"{seeing.kind(car)}@".startswith(f"{kind}@")
     if isinstance(vehicles, (str, int, float)):
         text = str(vehicles)
         try:
@@ -766,7 +769,7 @@ class Attachment:
         for car in here - before:
             self._seeing.meet(car)
         candidates = here if self._asks_again else here - before
-        picks = {car for car in candidates if self._chosen(self._sumo, car)}
+        picks = {car for car in candidates if self._chosen(self._seeing, car)}
         for car in candidates.intersection(self._cars.cars) - picks:
             self._cars.remove(car)
         for car in sorted(picks.difference(self._cars.cars)):
