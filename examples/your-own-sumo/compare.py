@@ -51,6 +51,8 @@ def drive(seed: int, *, guarded: bool) -> Run:
             most = max(most, len(cars))
             for car in cars:
                 speeds[kinds[car]].append(libsumo.vehicle.getSpeed(car))
+        for attachment in filter(None, (watch, guards)):
+            attachment.detach()
         libsumo.close()
     who = [(kinds[each.collider], kinds[each.victim]) for each in watch.collisions]
     by = sum(collider == "hasty" for collider, _ in who)
