@@ -23,7 +23,7 @@ from evofsm.fsm.naming import in_a_line
 from evofsm.fsm.observations import Category, ObservationEncoder
 from evofsm.guard.foresight import DATES
 from evofsm.io import tables, vehicles
-from evofsm.io.tables import MISSING, Piece, Skips, Table, Wanted, is_number
+from evofsm.io.tables import MISSING, CsvTable, ParquetTable, Piece, Skips, Table, Wanted, is_number
 from evofsm.io.vehicles import ACTION, PairTable, VehicleLengths
 
 if TYPE_CHECKING:
@@ -279,7 +279,7 @@ class Term(NamedTuple):
 class Condition(NamedTuple):
     """What holds of some rows: any of these, of each of which all terms hold."""
 
-    either: Sequence[Sequence[Term]]
+    either: Sequence[Sequence[Term]] = ()  #: of none it holds nowhere
 
     @classmethod
     def parse(cls, text: str, option: str = "--failed") -> Condition:
@@ -301,7 +301,7 @@ class Condition(NamedTuple):
     def holds(self, piece: Piece) -> Bools:
         """In which rows of a piece it holds."""
         parts = [np.logical_and.reduce([t.holds(piece) for t in terms]) for terms in self.either]
-        return np.asarray(np.logical_or.reduce(parts))
+        return np.asarray(np.logical_or.reduce([np.zeros(piece.rows, np.bool_), *parts]))
 
     def holds_of(self, row: Mapping[str, Any]) -> bool:
         """Whether it holds of one row, of values by column."""
@@ -574,8 +574,7 @@ def rows_of(chunks: Iterable[Chunk], names: Sequence[str] = VARIABLES) -> Iterat
 def _joined(parts: Sequence[Chunk]) -> Chunk:
     """Chunks as one; ``jumps`` are those of the last one."""
     arrays: Any = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _BY_ROW}
-    names = [name for part in parts for name in part.names]
-    return parts[-1]._replace(names=names, **arrays)
+    return parts[-1]._replace(names=[name for part in parts for name in part.names], **arrays)
 
 
 def _on_one_clock(chunks: Iterable[Chunk], columns: LogColumns, noted: Noted) -> Iterator[Chunk]:
@@ -594,8 +593,7 @@ def _on_one_clock(chunks: Iterable[Chunk], columns: LogColumns, noted: Noted) ->
     hows.append(methods.get(columns.action, "mean"))
     remainder: Chunk | None = None
     for chunk in chain(chunks, [None]):
-        parts = [part for part in (remainder, chunk) if part is not None]
-        if not parts:
+        if not (parts := [part for part in (remainder, chunk) if part is not None]):
             return
         noted.resampled += 0 if chunk is None else len(chunk.times)
         whole = _joined(parts)
@@ -654,10 +652,7 @@ def open_table(path: str, columns: LogColumns, skips: Skips) -> Table:
         return PairTable(path, vehicles.fcd_of_xml(path, skips), skips, columns.lengths)
     log_names = {*columns.observe.names, columns.action, columns.time}
     names = log_names.union(vehicles.OBJECT_COLUMNS, vehicles.FCD_COLUMNS)
-    of_parquet = kind == "parquet"
-    table: Table = (
-        tables.ParquetTable(path, skips) if of_parquet else tables.CsvTable(path, names, skips)
-    )
+    table: Table = ParquetTable(path, skips) if kind == "parquet" else CsvTable(path, names, skips)
     if {*columns.observe.names} <= {*table.columns}:
         return table
     if moments := vehicles.fcd_of_table(table):
@@ -774,7 +769,7 @@ class _Reader:
         usual = [name for name in USUAL_EPISODE if name in table.columns]
         self._episode = usual if columns.episode is None else list(columns.episode)
         self._conditions = columns.conditions
-        self._failed = self._conditions.get("--failed")
+        self._failed = self._conditions.get("--failed", Condition())
         self._terms = [term for c in self._conditions.values() for term in c.terms]
         self._before = 0  # rows
         self._first_date = self._last_date = np.nan
@@ -809,8 +804,7 @@ class _Reader:
             times = self._times(piece, is_date=bool(request.dates))
             signals = self._fill(piece, times) if clock.ticks else None
             starts, reports = self._starts(piece), np.zeros(piece.rows + 1, np.bool_)
-            if self._failed:
-                self._note_compared(piece, self._failed)
+            self._note_compared(piece)
             if signals is not None:
                 starts, reports = self._between(starts, *signals)
                 piece, times = piece.take(signals[0]), times[signals[0]]
@@ -845,7 +839,7 @@ class _Reader:
                 fails=fails[rows],
                 dt=clock.dt,
                 jumps=int(holes[rows].sum()),
-                tells=self._failed is not None,
+                tells="--failed" in self._conditions,
                 names=[piece.names[k] for k in episodes] if piece.names else (),
             )
         if last_chunk is not None:
@@ -866,7 +860,7 @@ class _Reader:
                 )
         if not self._hold:
             return None
-        tells = self._failed.holds(piece) if self._failed else np.zeros(piece.rows, np.bool_)
+        tells = self._failed.holds(piece)
         tells[-1] &= not any(term.may_end(piece) for term in self._terms)
         rows = np.arange(piece.rows + 1)
         for name in set(piece.numbers) - {self._columns.time}:
@@ -888,8 +882,7 @@ class _Reader:
         table, columns = self._table, self._columns
         clock = []
         if self._clock.ticks:  # a date and a time of day may be two columns
-            is_one = columns.time in table.columns
-            clock = [columns.time] if is_one else columns.time.split(",")
+            clock = [columns.time] if columns.time in table.columns else columns.time.split(",")
         categories = [v.name for v in self._variables if isinstance(v, Category)]
         options = {
             **{t.column: option for option, c in self._conditions.items() for t in c.terms},
@@ -916,7 +909,7 @@ class _Reader:
         is_dated = clock and (form or tables.is_date(" ".join(map(table.first, clock))))
         numbers = [*self._observed, columns.action, *(t.column for t in self._terms if t.of_number)]
         numbers = [*dict.fromkeys([*numbers, *([] if is_dated else clock)])]
-        usual = columns.usual_units if isinstance(table, tables.CsvTable) else {}
+        usual = columns.usual_units if isinstance(table, CsvTable) else {}
         units = {name: unit for name in numbers if (unit := {**usual, **table.units}.get(name))}
         of_options = {name: unit for name, unit in columns.units.items() if unit != form}
         try:
@@ -951,8 +944,7 @@ class _Reader:
 
     def _times(self, piece: Piece, *, is_date: bool) -> Floats:
         if not self._clock.ticks:
-            rows = np.arange(self._before, self._before + piece.rows)
-            return rows * np.float64(self._clock.dt)
+            return np.arange(self._before, self._before + piece.rows) * np.float64(self._clock.dt)
         times = np.where(piece.bad, np.nan, piece.numbers[self._columns.time])
         if not is_date:
             is_excel = np.abs(times - 3.9e9) < 8e8  # days since 1899-12-30
@@ -1021,12 +1013,11 @@ class _Reader:
         """
         columns, failed = self._columns, self._failed
         action = columns.action
-        is_incomplete, nobody, elsewhere, still = np.zeros((4, piece.rows), np.bool_)
+        is_incomplete, elsewhere = np.zeros((2, piece.rows), np.bool_)
         if columns.no_leader or columns.resample or self._hold:
             for name in self._observed:
                 is_incomplete |= ~np.isfinite(piece.numbers[name])
-        if "--no-leader" in self._conditions:
-            nobody = self._conditions["--no-leader"].holds(piece)
+        nobody = self._conditions.get("--no-leader", Condition()).holds(piece)
         if "--where" in self._conditions:
             elsewhere = ~self._conditions["--where"].holds(piece)
         is_incomplete |= nobody
@@ -1042,35 +1033,32 @@ class _Reader:
         piece.leave_out(action, piece.unusable(action) & ~is_left_out & ~unknown)
         if not (self._table.derives or columns.resample or action in self._observed):
             self._count_unknown(piece, unknown & ~is_left_out, starts)
-        for term in failed.terms if failed else ():
+        for term in failed.terms:
             if term.of_number and term.column not in self._observed:
                 piece.leave_out(term.column, np.isnan(piece.numbers[term.column]) & ~is_left_out)
         for term in self._terms:
             term.leave_out(piece)
-        fails = np.zeros(piece.rows, np.bool_)
-        holds = fails if failed is None else (failed.holds(piece) | reports[1:]) & ~nobody
+        holds = (failed.holds(piece) | reports[1:]) & ~nobody
         is_kept = ~(is_left_out | piece.bad | late)
-        self._failed_before = False
-        if failed:
-            for row in np.flatnonzero(late)[::-1]:  # whose time the row before has
-                holds[max(row - 1, 0)] |= holds[row]
-            for row in np.flatnonzero(late):
-                holds[row] = holds[row - 1] if row else self._held
-            self._noted.failing += int(holds.sum() + reports[0])
-            before = np.append(self._held, holds[:-1]) & ~anew
-            self._held = bool(holds[-1])
-            fails, still = holds & ~before, holds & before
-            if fails[-1] and any(term.may_end(piece) for term in failed.terms):
-                piece.leave_out(piece.cut, np.arange(piece.rows) == piece.rows - 1, _CUT)
-                fails[-1] = is_kept[-1] = False
-            # What fails as it is left out is the end of the episode before.
-            prior_ends = fails & ~is_kept & ~starts & np.append(self._kept, is_kept[:-1])
-            still |= prior_ends  # it is over
-            self._noted.unplaced += int((fails & ~is_kept & ~prior_ends).sum())
-            self._noted.after_failure += int((still & is_kept).sum())
-            self._failed_before = bool(prior_ends[0] | (reports[0] & self._kept))
-            fails = (fails & is_kept) | np.append(prior_ends[1:], False)
-            is_kept &= ~still
+        for row in np.flatnonzero(late)[::-1]:  # whose time the row before has
+            holds[max(row - 1, 0)] |= holds[row]
+        for row in np.flatnonzero(late):
+            holds[row] = holds[row - 1] if row else self._held
+        self._noted.failing += int(holds.sum() + reports[0])
+        before = np.append(self._held, holds[:-1]) & ~anew
+        self._held = bool(holds[-1])
+        fails, still = holds & ~before, holds & before
+        if fails[-1] and any(term.may_end(piece) for term in failed.terms):
+            piece.leave_out(piece.cut, np.arange(piece.rows) == piece.rows - 1, _CUT)
+            fails[-1] = is_kept[-1] = False
+        # What fails as it is left out is the end of the episode before.
+        prior_ends = fails & ~is_kept & ~starts & np.append(self._kept, is_kept[:-1])
+        still |= prior_ends  # it is over
+        self._noted.unplaced += int((fails & ~is_kept & ~prior_ends).sum())
+        self._noted.after_failure += int((still & is_kept).sum())
+        self._failed_before = bool(prior_ends[0] | (reports[0] & self._kept))
+        fails = (fails & is_kept) | np.append(prior_ends[1:], False)
+        is_kept &= ~still
         self._noted.elsewhere += int((elsewhere & ~is_incomplete).sum())
         self._noted.leaderless += int(is_incomplete.sum())
         if columns.no_leader or not columns.longest_hole:
@@ -1086,9 +1074,9 @@ class _Reader:
         self._kept = bool(is_kept[-1])
         return is_kept, fails
 
-    def _note_compared(self, piece: Piece, failed: Condition) -> None:
+    def _note_compared(self, piece: Piece) -> None:
         """What stands in the columns that tell of failures, should no row meet what is asked."""
-        for term in failed.terms:
+        for term in self._failed.terms:
             entries: list[Any] = self._noted.compared.setdefault(term.column, [])
             if term.of_number:
                 values = piece.numbers[term.column]
