@@ -3,6 +3,7 @@
 import csv
 import gzip
 import io
+import math
 import re
 import sys
 import tracemalloc
@@ -394,18 +395,6 @@ def test_any_name_of_a_column_can_be_said(tmp_path, name):
 # -- Two witnesses ---------------------------------------------------------------------------------
 
 
-def driven(rows=300):
-    """One car behind another: time, gap, both speeds and the acceleration agree."""
-    time, leads = 0.1 * np.arange(rows), 20.0 + 3.0 * np.sin(np.arange(rows) / 30)
-    gap, own, does = [20.0], [20.0], []
-    for lead in leads:
-        does.append(0.3 * (gap[-1] - 20.0) + 0.8 * (lead - own[-1]))
-        gap.append(gap[-1] + 0.1 * (lead - own[-1]))
-        own.append(own[-1] + 0.1 * does[-1])
-    columns = time, np.array(gap[:-1]), np.array(own[:-1]), leads, np.array(does)
-    return dict(zip(("time", "gap", "v_follower", "v_leader", "a_follower"), columns, strict=True))
-
-
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -418,16 +407,20 @@ def driven(rows=300):
     ],
 )
 def test_what_columns_say_of_each_other_is_compared(tmp_path, change, said):
-    columns = driven()
-    frame = {name: values * change.get(name, 1.0) for name, values in columns.items()}
+    rows, gap, own = [], 20.0, 20.0  # one car behind another, where all agree
+    for k in range(300):
+        lead = 20.0 + 3.0 * math.sin(k / 30)
+        rows.append((0.1 * k, gap, own, lead, 0.3 * (gap - 20.0) + 0.8 * (lead - own)))
+        gap, own = gap + 0.1 * (lead - own), own + 0.1 * rows[-1][-1]
+    frame = polars.DataFrame(rows, HEADER.split(",")[3:], orient="row")
     path, noted = tmp_path / "a.parquet", Noted()
-    polars.DataFrame(frame).write_parquet(path)
+    scaled = (polars.col(name) * factor for name, factor in change.items())
+    frame.with_columns(*scaled).write_parquet(path)
     read(str(path), noted=noted)
     told = " ".join(warnings_of(noted))
     assert all(text in told for text in said)
     assert bool(told) == bool(said)
-    swapped = columns | {"v_follower": columns["v_leader"], "v_leader": columns["v_follower"]}
-    polars.DataFrame(swapped).write_parquet(path)
+    frame.rename({"v_follower": "v_leader", "v_leader": "v_follower"}).write_parquet(path)
     read(str(path), noted=(noted := Noted()))
     assert "are the speeds mixed up?" in " ".join(warnings_of(noted))
 
@@ -435,19 +428,15 @@ def test_what_columns_say_of_each_other_is_compared(tmp_path, change, said):
 # -- Signals of several clocks ---------------------------------------------------------------------
 
 
-def joined(rows=40):
-    """Gap, speeds and action at times of their own: a row has one of them, or two."""
-    for k in range(rows):
-        yield f"p,{k / 10:.2f},{k},,,,"
-        yield f"p,{k / 10 + 0.03:.2f},,10,,{k / 100},{int(k == 30)}"
-        if k != 20:
-            yield f"p,{k / 10 + 0.06:.2f},,,{11 + k},,"
-
-
 @pytest.mark.parametrize("pieces", [1 << 11, 1 << 20], indirect=True)
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
 def test_signals_of_several_clocks_are_held_at_the_times_of_actions(tmp_path, pieces, ending):
-    path, noted = write(tmp_path / "a.csv", joined(), SHORT), Noted()
+    rows, noted = [], Noted()
+    for k in range(40):
+        rows.append(f"p,{k / 10:.2f},{k},,,,")
+        rows.append(f"p,{k / 10 + 0.03:.2f},,10,,{k / 100},{int(k == 30)}")
+        rows += [f"p,{k / 10 + 0.06:.2f},,,{11 + k},,"] * (k != 20)
+    path = write(tmp_path / "a.csv", rows, SHORT)
     if ending == "parquet":
         polars.read_csv(path).write_parquet(tmp_path / "a.parquet")
         path = str(tmp_path / "a.parquet")

@@ -291,38 +291,26 @@ ROUTES = """<routes>
 </routes>"""
 
 
-@pytest.fixture(scope="module")
-def sumo(tmp_path_factory, sumo_road):
-    """Writes FCD with SUMO: where it is, and what b and c did."""
-    folder = tmp_path_factory.mktemp("sumo")
-    sumo_road(folder, 2000)
-    (folder / "routes.xml").write_text(ROUTES)
-
-    def drive(name, *options):
-        files = "-n", folder / "road.net.xml", "-r", folder / "routes.xml"
-        written = "--step-length", 0.1, "--no-step-log", "--fcd-output", folder / name
-        libsumo.start([*map(str, ("sumo", *files, *written)), *options])
-        seen, car = [], libsumo.vehicle
-        while libsumo.simulation.getTime() < 20:
-            libsumo.simulationStep()
-            if {"b", "c"} <= set(car.getIDList()):
-                gap = car.getLanePosition("b") - car.getLength("b") - car.getLanePosition("c")
-                seen.append([gap, car.getSpeed("c"), car.getSpeed("b")])
-        libsumo.close()
-        return folder / name, np.array(seen)
-
-    return drive
-
-
 @pytest.mark.parametrize(
     "ending", ["xml", *(pytest.param(one, marks=pytest.mark.slow) for one in ("xml.gz", "csv"))]
 )
-def test_pairs_are_those_that_sumo_drove(sumo, ending):
-    path, truth = sumo(f"truth.{ending}", "--precision", "6")
+def test_pairs_are_those_that_sumo_drove(tmp_path, sumo_road, ending):
+    sumo_road(tmp_path, 2000)
+    (tmp_path / "routes.xml").write_text(ROUTES)
+    files = "-n", tmp_path / "road.net.xml", "-r", tmp_path / "routes.xml"
+    written = "--fcd-output", (path := tmp_path / f"truth.{ending}"), "--precision", 6
+    libsumo.start([*map(str, ("sumo", *files, *written, "--step-length", 0.1, "--no-step-log"))])
+    truth, car = [], libsumo.vehicle
+    while libsumo.simulation.getTime() < 20:
+        libsumo.simulationStep()
+        if {"b", "c"} <= set(car.getIDList()):
+            gap = car.getLanePosition("b") - car.getLength("b") - car.getLanePosition("c")
+            truth.append([gap, car.getSpeed("c"), car.getSpeed("b")])
+    libsumo.close()
     found = episodes(path, lengths=lengths_given(["truck=12"]))
-    (mine,) = [rows for rows, _, _ in found if abs(rows[0, 0] - truth[0, 0]) < 1e-5]
+    (mine,) = [rows for rows, _, _ in found if abs(rows[0, 0] - truth[0][0]) < 1e-5]
     assert len(mine) == len(truth) > 30
-    assert mine == pytest.approx(truth, abs=2e-6)
+    assert mine == pytest.approx(np.array(truth), abs=2e-6)
 
 
 # -- Objects --------------------------------------------------------------------------------------
