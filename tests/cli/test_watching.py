@@ -175,19 +175,14 @@ def test_every_sentence_says_what_was_so(how, idle):
 # -- A log of others ------------------------------------------------------------------------------
 
 
-def objects(path, rows=80):
-    """Two cars at 20 m/s, of which the one ahead brakes with 5 m/s² after 4 s."""
+def test_a_guard_decides_on_each_row_of_a_log_and_changes_nothing(tmp_path):
     lines, x, v = ["id,t,x,y,vx,vy,length,lane"], 40.0, 20.0
-    for k in range(rows):
+    for k in range(80):
         lines.append(f"ego,{0.1 * k:.1f},{2.0 * k:.2f},0,20,0,4,1")
         lines.append(f"other,{0.1 * k:.1f},{x:.3f},0,{v:.2f},0,4,1")
-        x, v = x + 0.1 * v, max(0.0, v - (0.5 if k >= 40 else 0.0))
-    path.write_text("\n".join(lines) + "\n")
-    return str(path)
-
-
-def test_a_guard_decides_on_each_row_of_a_log_and_changes_nothing(tmp_path):
-    shown = watched_log(objects(tmp_path / "objects.csv"), reading_of())
+        x, v = x + 0.1 * v, max(0.0, v - (0.5 if k >= 40 else 0.0))  # it brakes with 5 m/s²
+    (path := tmp_path / "objects.csv").write_text("\n".join([*lines, ""]))
+    shown = watched_log(str(path), reading_of())
     assert shown.start.cases == ("ego behind other, from 0.0 s (collision)",)
     assert not shown.revising
     first, *_, last = frames = drive(shown)
