@@ -226,7 +226,7 @@ def test_what_has_a_name_in_a_message_is_known_by_it(tmp_path):
     assert "no messages with /joints.position[foot]" in refused(path, **feet)
 
 
-def test_of_mcap_that_ends_early_the_beginning_is_read(tmp_path):
+def test_of_mcap_that_ends_early_the_beginning_is_read_and_of_sqlite_nothing(tmp_path):
     (whole,) = read(write(tmp_path / "bag", drive(60.0), MCAP))
     (path,), noted = (tmp_path / "bag").glob("*.mcap"), Noted()
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 9 // 10])
@@ -237,6 +237,9 @@ def test_of_mcap_that_ends_early_the_beginning_is_read(tmp_path):
     path.write_bytes(path.read_bytes()[:3000])
     with pytest.raises(ValueError, match=r"byte .*: it ends .* before .* it has no message"):
         read(str(path))
+    (path,) = Path(write(tmp_path / "other", drive())).glob("*.db3")
+    path.write_bytes(path.read_bytes()[:20_000])
+    assert "cannot be read as a bag of ROS 2" in refused(str(path))
 
 
 def test_an_action_may_be_mapped_and_failures_be_told_of_by_a_comparison(tmp_path):
@@ -263,13 +266,6 @@ def test_what_a_recorder_that_was_killed_left_beside_its_file_is_read(tmp_path, 
     there = {*tmp_path.iterdir()}
     assert read(str(tmp_path / file.name))[0].times[-1] == pytest.approx(1.0)
     assert {*tmp_path.iterdir()} == there
-
-
-def test_a_bag_that_is_damaged_says_so(tmp_path):
-    path = write(tmp_path / "bag", drive())
-    (file,) = (one for one in (tmp_path / "bag").iterdir() if one.suffix == ".db3")
-    file.write_bytes(file.read_bytes()[:20_000])
-    assert "cannot be read as a bag of ROS 2" in refused(path)
 
 
 @pytest.mark.parametrize(
