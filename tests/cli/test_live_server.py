@@ -158,17 +158,6 @@ def test_who_comes_late_is_shown_all_of_it(page):
     assert {"clock", "graph"} <= set(kinds)
 
 
-def test_pages_act_on_the_run(page):
-    acts = {"revise": ("revising", False), "speed": ("speed", 8), "pause": ("paused", False)}
-    with looking_on(page) as client:
-        told(client, "clock")
-        for command, (name, value) in acts.items():
-            client.send(json.dumps({"do": command, "value": value}))
-            assert told(client, "clock")[name] == value
-        client.send('{"do": "case", "value": 3}')
-        assert told(client, "start")["case"] == 3
-
-
 def test_a_page_is_served_while_what_is_watched_hangs_or_broke_off(page, monkeypatch):
     goes, why = threading.Event(), "ZeroDivisionError: division by zero"
     monkeypatch.setattr(page.player._watched, "step", lambda: goes.wait(60) and 1 / 0)
