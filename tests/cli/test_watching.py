@@ -232,8 +232,6 @@ def test_what_was_before_is_shown_at_once(shown):
 
 # -- A judge that was told nothing but which episodes failed --------------------------------------
 
-LEADERS = ("leader brake", "leaders", "latent risk", "braking in full")
-
 
 def told_over(episodes, *, on=True):
     """Frames of a run under a learnt judge, each with its story in words."""
@@ -253,9 +251,10 @@ def test_before_the_first_failure_nothing_is_called_safe():
 @pytest.mark.slow
 def test_a_learnt_judge_is_not_said_to_know_how_leaders_brake():
     frames = [*told_over(12), *told_over(12, on=False)]
+    leaders = "leader brake", "leaders", "latent risk", "braking in full"
     for _, told in frames:
         said = " ".join((told.headline, told.when, told.why, told.done)).lower()
-        assert not any(words in said for words in LEADERS), said
+        assert not any(words in said for words in leaders), said
     assert any("disturbances remembered from" in told.why for _, told in frames)
     assert {"dead end", "failure"} <= {told.status for _, told in frames}
     for frame, told in frames:  # what it changes where it sees no danger, it changes for the margin
