@@ -40,16 +40,11 @@ def configuration(tmp_path, sumo_road):
 
 
 def test_guards_act_where_they_are_told_to(evofsm, configuration):
-    found = {}
-    for mode in ("shadow", "act"):
-        asked = ("drive", configuration, "--vehicles", "type:hasty", "--mode", mode, "--json")
-        found[mode] = json.loads(evofsm(*asked).output)
-    assert found["shadow"]["collisions"] == found["shadow"]["of_guarded"] > 0
-    assert found["act"]["collisions"] == 0
-    assert found["act"]["cars"] == 1
-    assert found["act"]["speed"] > 0.9 * found["shadow"]["speed"]
-    assert found["act"]["alone"]["collisions"] == found["shadow"]["collisions"]
-    assert found["shadow"]["revised"] > 0
+    found = json.loads(evofsm("drive", configuration, "--vehicles", "type:hasty", "--json").output)
+    alone = found["alone"]
+    assert alone["collisions"] == alone["of_guarded"] > 0
+    assert (found["collisions"], found["cars"]) == (0, 1)
+    assert found["speed"] > 0.9 * alone["speed"]
     configuration = configuration.rename(configuration.with_name("my.sumo.cfg"))
     some = evofsm("drive", configuration, "--vehicles", "ego,eg")
     assert re.search(r"collisions +[1-9] +0\n", some.stdout)
