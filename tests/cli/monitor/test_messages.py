@@ -179,13 +179,9 @@ def understood(message):
         return bool(error.about) and "\n" not in str(error)
 
 
-@given(st.binary(max_size=60))
-def test_any_bytes_are_refused_or_understood(junk):
+@given(st.binary(max_size=60), st.dictionaries(KEYS, SOME))
+def test_any_bytes_and_any_json_are_refused_or_understood(junk, changed):
     assert understood(junk)
-
-
-@given(st.dictionaries(KEYS, SOME))
-def test_any_json_is_refused_or_understood(changed):
     assert understood(json.dumps(ROW | changed).encode())
     assert understood(json.dumps(changed).encode())
     told = {"time": 0, "proposal": 0, "ego": EGO | changed, "objects": [TRUCK, TRUCK | changed]}
