@@ -113,18 +113,16 @@ def test_rows_hold_the_latest_values_before_them(tmp_path, plugin, mode):
     assert (read(str(file))[0].observations == chunk.observations).all()  # without its folder
 
 
-FOREIGN = [
-    ("own/msg/Own", "float64 x\nown/Other y\n", "cdr"),
-    ("own/msg/Idl", "module own { nonsense <<< };", "cdr"),
-    ("own/srv/Do_Event", "service_msgs/ServiceEventInfo info\n", "cdr"),
-    ("own/msg/Empty", "", "json"),
-    ("nav_msgs/msg/Odometry", "wstring what\n", "cdr"),  # of another version
-]
-
-
 @pytest.mark.parametrize("plugin", [SQLITE, MCAP])
 def test_topics_that_nobody_asked_for_may_hold_anything(tmp_path, plugin):
-    path = write(tmp_path / "bag", drive(), plugin, foreign=FOREIGN)
+    foreign = [
+        ("own/msg/Own", "float64 x\nown/Other y\n", "cdr"),
+        ("own/msg/Idl", "module own { nonsense <<< };", "cdr"),
+        ("own/srv/Do_Event", "service_msgs/ServiceEventInfo info\n", "cdr"),
+        ("own/msg/Empty", "", "json"),
+        ("nav_msgs/msg/Odometry", "wstring what\n", "cdr"),  # of another version
+    ]
+    path = write(tmp_path / "bag", drive(), plugin, foreign=foreign)
     (plain,) = read(write(tmp_path / "plain", drive(), plugin))
     (file,) = (one for one in (tmp_path / "bag").iterdir() if one.suffix != ".yaml")
     for place in (path, str(file)):
