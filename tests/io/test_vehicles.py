@@ -393,9 +393,8 @@ def test_objects_that_cannot_be_right_are_refused_in_words(tmp_path, rows, said)
 def assert_pair(path):
     (chunk,) = read_traces([str(path)])
     gaps = 46.0 - 0.2 * np.arange(5)
-    assert chunk.observations == pytest.approx(
-        np.column_stack([gaps, gaps * 0 + 20, gaps * 0 + 18])
-    )
+    expected = np.column_stack([gaps, np.full(5, 20.0), np.full(5, 18.0)])
+    assert chunk.observations == pytest.approx(expected)
     assert chunk.times == pytest.approx(5.0 + 0.1 * np.arange(5))
 
 

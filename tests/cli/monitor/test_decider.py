@@ -32,9 +32,8 @@ def test_it_decides_as_the_guard_does(mode):
     decider, guard = Decider(made(mode=mode)), made(mode=mode)
     for row in rows(80):
         answer = decider.answer(line(row))
-        revision = guard.decide(
-            [row[k] for k in ("gap", "v_follower", "v_leader")], 0.5, row["time"]
-        )
+        observation = [row[name] for name in ("gap", "v_follower", "v_leader")]
+        revision = guard.decide(observation, 0.5, row["time"])
         executed = 0.5 if mode is Mode.SHADOW else revision.advised
         assert answer["executed"] == revision.executed == executed
         for name in ("risk_proposed", "advised", "reason"):
