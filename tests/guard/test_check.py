@@ -58,22 +58,17 @@ class KeepsObservation(Driver):
         return super().propose(before)
 
 
-class BrokenReviser(Unrevised):
-    def __init__(self):
-        super().__init__(ACTIONS)
-
-
 def reviser(change):
     """One who changes a revision so, knowing the proposal."""
 
-    class Changing(BrokenReviser):
+    class Changing(Unrevised):
         def revise(self, situation, proposal):
             return change(super().revise(situation, proposal), proposal.action)
 
-    return Changing
+    return Changing(ACTIONS)
 
 
-class NeverCalms(BrokenReviser):
+class NeverCalms(Unrevised):
     scared = False
 
     def revise(self, situation, proposal):
@@ -82,18 +77,13 @@ class NeverCalms(BrokenReviser):
         return revision._replace(executed=-2.5) if self.scared else revision
 
 
-class BrokenJudge(LatentRisk):
-    def __init__(self):
-        super().__init__(lowest=-2.5)
-
-
-class RiskInPercent(BrokenJudge):
+class RiskInPercent(LatentRisk):
     def judge(self, situation, actions):
         judged = super().judge(situation, actions)
         return judged._replace(risk=100.0 * judged.risk, high=100.0 * judged.high)
 
 
-class LearnsFromQuestions(BrokenJudge):
+class LearnsFromQuestions(LatentRisk):
     asked = 0
 
     def judge(self, situation, actions):
@@ -102,7 +92,7 @@ class LearnsFromQuestions(BrokenJudge):
         return judged._replace(risk=judged.risk * 0.99**self.asked, low=0.0 * judged.low)
 
 
-class LearnsFrozen(BrokenJudge):
+class LearnsFrozen(LatentRisk):
     seen = 0
 
     def follow(self, observation, action):
@@ -114,7 +104,7 @@ class LearnsFrozen(BrokenJudge):
         return judged._replace(low=np.full(len(actions), 0.5**self.seen * judged.low))
 
 
-class FileForgetsLearnt(BrokenJudge):
+class FileForgetsLearnt(LatentRisk):
     def save(self, path, provenance=None):
         LatentRisk(lowest=-2.5).save(path, provenance)
 
@@ -148,15 +138,15 @@ BROKEN = {
         reviser(lambda revision, action: revision._replace(seen=round(action))),
         reviser(lambda revision, action: revision._replace(reason="")),
     ],
-    "an_episode_starts_anew": [NeverCalms],
+    "an_episode_starts_anew": [NeverCalms(ACTIONS)],
     "answers_hang_on_inputs_alone": [
         driver(lambda seen: seen.fill(0.0) or Proposal(0.0)),
         KeepsObservation,
         driver(lambda seen: Proposal(random.random())),
     ],
-    "judges_each_action": [RiskInPercent],
-    "learns_only_from_what_happens": [LearnsFromQuestions, LearnsFrozen],
-    "a_file_keeps_it": [FileForgetsLearnt],
+    "judges_each_action": [RiskInPercent(-2.5)],
+    "learns_only_from_what_happens": [LearnsFromQuestions(-2.5), LearnsFrozen(-2.5)],
+    "a_file_keeps_it": [FileForgetsLearnt(-2.5)],
     "is_frozen": [NotFrozen, Thawed],
     "a_machine_takes_it": [NegativeRadius, NotRegistered],
 }
