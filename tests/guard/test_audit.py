@@ -331,26 +331,23 @@ def forge(path, target, kind, which, change):
     return number
 
 
-def precede(start):
-    """As if an episode had begun before any guard was named."""
-    clock = start["clock"]
-    start.clear()
-    start.update(kind="begin", clock=clock)
-
-
 def other(name, value):
     return lambda content: content.update({name: value})
 
 
-def hide(decision):
-    """As if the proposal had been executed."""
-    quiet = {name: decision[name] for name in (*FIELDS["quiet"], "clock")}
-    decision.clear()
-    decision.update(kind="quiet", **quiet)
+def become(kind):
+    """A record of a kind that holds less."""
+
+    def change(content):
+        kept = {name: content[name] for name in (*FIELDS[kind], "clock")}
+        content.clear()
+        content.update(kind=kind, **kept)
+
+    return change
 
 
 REPLAYED = {
-    "hidden": ("decision", 0, hide),
+    "hidden": ("decision", 0, become("quiet")),  # as if the proposal had been executed
     "executed": ("decision", 3, lambda it: it.update(executed=math.nextafter(it["executed"], 9))),
     "observation": ("decision", 3, other("observation", [90.0, 15.0, 15.0])),
     "reason": ("decision", 2, other("reason", "the driver wished it")),
@@ -366,7 +363,7 @@ REPLAYED = {
 MISFITS = {
     **{f"version {one!r}": ("start", other("version", one)) for one in (0, 99, 1.0, True, "1")},
     "no version": ("start", lambda content: content.pop("version")),
-    "before the first guard": ("start", precede),
+    "before the first guard": ("start", become("begin")),
     "another kind": ("end", other("kind", "nonsense")),
     "no explanation": ("decision", lambda content: content.pop("explanation")),
     "what nobody writes": ("decision", other("comment", "all was well")),
