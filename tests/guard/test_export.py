@@ -18,9 +18,6 @@ from evofsm.driving import LatentRisk, guard_for_cars
 from evofsm.guard import Fallback, Mode
 from evofsm.guard.export import write_c99, write_fmu
 
-PAGE = Path(__file__).parents[2] / "docs" / "on-your-target.md"
-
-
 pytestmark = pytest.mark.skipif(
     not (shutil.which("cc") and shutil.which("c++")), reason="there is nothing to compile with"
 )
@@ -330,7 +327,8 @@ def test_two_guards_are_linked_into_one_program_whatever_is_called_so_in_c(wall,
 @pytest.mark.slow
 def test_the_program_of_the_page_runs(wall, tmp_path):
     write_c99(wall.guard, tmp_path)
-    program = re.search(r"```cpp\n(.*?)```", PAGE.read_text(), flags=re.S)[1]
+    page = Path(__file__).parents[2] / "docs" / "on-your-target.md"
+    program = re.search(r"```cpp\n(.*?)```", page.read_text(), flags=re.S)[1]
     (tmp_path / "main.cpp").write_text(program)
     said = run_cpp(tmp_path, "main.cpp", "evofsm")
     places = [float(line.split()[1]) for line in said]
