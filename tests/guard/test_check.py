@@ -40,22 +40,17 @@ def test_parts_of_ours_keep_their_contract(part):
     assert not failed(part)
 
 
-class Driver:
-    def propose(self, observation, time=0.0):
-        return Proposal(float(np.clip(0.1 * (observation[0] - 20.0), -3.0, 3.0)))
-
-
 def driver(answer):
     """A driver who answers an observation so."""
-    return type("Driver", (Driver,), {"propose": lambda self, seen, time=0.0: answer(seen)})
+    return type("Driver", (), {"propose": lambda self, seen, time=0.0: answer(seen)})
 
 
-class KeepsObservation(Driver):
+class KeepsObservation:
     kept = np.zeros(3)
 
     def propose(self, observation, time=0.0):
         before, self.kept = self.kept, observation
-        return super().propose(before)
+        return Proposal(float(np.clip(0.1 * (before[0] - 20.0), -3.0, 3.0)))
 
 
 def reviser(change):
