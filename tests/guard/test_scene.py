@@ -200,15 +200,12 @@ def test_a_file_that_no_learning_could_have_left_is_refused(taught, forge, tmp_p
         SceneRisk.load(tmp_path / "judge")
 
 
-@pytest.mark.parametrize(
-    ("make", "why"),
-    [
+def test_what_it_cannot_work_with_is_refused():
+    for make, why in (
         (lambda: SceneRisk(1.0, 3, columns=3), "columns is 3"),
         (lambda: SceneRisk(0.0, 3), "dt"),
         (lambda: Rain().guard().decide(np.ones(7), STAY), "7 numbers are no rows of 4"),
         (lambda: Guard(n_actions=4, interval=1.0, judge=SceneRisk(1.0, 3)), "3 choices"),
-    ],
-)
-def test_what_it_cannot_work_with_is_refused(make, why):
-    with pytest.raises(ValueError, match=why):
-        make()
+    ):
+        with pytest.raises(ValueError, match=why):
+            make()
