@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from evofsm.guard import LearntRisk
-from evofsm.guard.learnt.rollout import features
+from evofsm.guard.learnt.rollout import expected
 
 
 def follow(judge, Z, U, *, failed=False):
@@ -42,13 +42,11 @@ def taught(episodes=4, seed=0):
 
 def ahead(judge, z, action, steps=4):
     """(steps, m) what is observed under an action, from rest, if nothing disturbs it."""
-    z, change, model = np.array([z], np.float64), np.zeros((1, len(z))), judge.parts.model
-    u, path = judge.encode(action)[None], []
+    change, u, path = np.zeros(len(z)), judge.encode(action), []
     for before in [np.zeros_like(u), *[u] * (steps - 1)]:
-        move = features(model, z, change, before, u) @ model.weights
-        after = np.clip(z + np.clip(move, model.least, model.most), model.lowest, model.highest)
+        after = expected(judge.parts.model, np.concatenate([z, change, before]), u)
         z, change = after, after - z
-        path.append(z[0])
+        path.append(z)
     return np.array(path)
 
 
