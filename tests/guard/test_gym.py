@@ -1012,14 +1012,11 @@ def test_stable_baselines3_trains_in_several_environments_under_one_guard(capsys
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("example", "arguments"),
-    [
-        ("car_following", ["--episodes", "8", "--train", "4"]),
-        ("highway", ["--episodes", "3", "--train", "1"]),
-    ],
+    "words", ["car_following --episodes 8 --train 4", "highway --episodes 3 --train 1"]
 )
-def test_in_the_examples_collisions_fall(monkeypatch, capsys, example, arguments):
+def test_in_the_examples_collisions_fall(monkeypatch, capsys, words):
     monkeypatch.syspath_prepend(EXAMPLES)
+    example, *arguments = words.split()
     unrevised, revised = importlib.import_module(example).main(arguments)
     assert unrevised.collisions >= len(unrevised.speeds) - 1
     assert revised.collisions == 0
