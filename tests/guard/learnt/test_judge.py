@@ -347,20 +347,19 @@ def test_actions_that_act_late_are_learnt_of_where_the_latest_are_observed():
     """The pole falls soon: an action that comes three decisions late has to be known of."""
 
     def failures(guard, episodes):
-        return sum(fly(guard, np.random.default_rng(episode)) for episode in episodes)
-
-    def fly(guard, rng):
-        angle, rate = rng.normal(0.0, 0.05, 2)
-        to_come = [0.0] * 3
-        for _ in range(150):
-            action = guard.decide([angle, rate, *to_come], rng.uniform(-1.0, 1.0)).executed
-            rate += 0.05 * (5.0 * np.sin(angle) + 6.0 * to_come[0]) + 0.001 * rng.normal()
-            angle += 0.05 * rate
-            to_come = [*to_come[1:], float(action)]
-            if abs(angle) > 0.5:
-                break
-        guard.end(abs(angle) > 0.5, [angle, rate, *to_come])
-        return abs(angle) > 0.5
+        failed = []
+        for rng in map(np.random.default_rng, episodes):
+            (angle, rate), to_come = rng.normal(0.0, 0.05, 2), [0.0] * 3
+            for _ in range(150):
+                action = guard.decide([angle, rate, *to_come], rng.uniform(-1.0, 1.0)).executed
+                rate += 0.05 * (5.0 * np.sin(angle) + 6.0 * to_come[0]) + 0.001 * rng.normal()
+                angle += 0.05 * rate
+                to_come = [*to_come[1:], float(action)]
+                if abs(angle) > 0.5:
+                    break
+            failed.append(abs(angle) > 0.5)
+            guard.end(failed[-1], [angle, rate, *to_come])
+        return sum(failed)
 
     guard = Guard(-1.0, 1.0, interval=0.05)
     assert failures(Guard(-1.0, 1.0, interval=0.05, mode=Mode.OFF), range(100, 110)) == 10
