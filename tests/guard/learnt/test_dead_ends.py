@@ -27,8 +27,7 @@ def play(guard, road, episode, see=lambda z: z):
 
 def taught(see=lambda z: z, times=2):
     """A guard that knows the wall, and met the trap some times."""
-    judge = LearntRisk(0.1, -1.0, 1.0)
-    guard = Guard(low=-1.0, high=1.0, interval=0.1, judge=judge, explaining=True)
+    guard = Guard(-1.0, 1.0, interval=0.1, judge=LearntRisk(0.1, -1.0, 1.0), explaining=True)
     for episode in range(4):
         play(guard, episode % 2, episode, see)
     for episode in range(10, 10 + times):
