@@ -66,10 +66,8 @@ def test_observations_of_any_kind_are_the_same(given, grown, snapshot):
 
 
 def test_a_width_beyond_all_bounds_leaves_no_belief_to_states_that_are_not_there():
-    machine = EvolvingFSM(1, rule=Novelty(radius=1e100, spread=1e100))
-    assert machine.observe([0.0]).belief.tolist() == [1.0]
-    machine = EvolvingFSM(1, rule=Novelty(radius=1e100))
-    assert machine.observe([0.0]).belief.tolist() == [1.0]
+    for rule in (Novelty(radius=1e100, spread=1e100), Novelty(radius=1e100)):
+        assert EvolvingFSM(1, rule=rule).observe([0.0]).belief.tolist() == [1.0]
 
 
 def test_a_question_changes_nothing_and_its_answer_is_the_askers_own(grown, snapshot):
