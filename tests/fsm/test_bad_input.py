@@ -26,6 +26,12 @@ ACTIONS = {
     "too high": (3, ValueError, "action is 3; there are actions 0 to 2"),
     "below zero": (-1, ValueError, "action is -1; there are actions 0 to 2"),
 }
+# Of which the second entry is masked.
+HIDDEN = {
+    "numbers": np.ma.array([0.5, 7.0], mask=[False, True]),
+    "whole numbers": np.ma.array([1, 7], mask=[False, True]),
+    "flags": np.ma.array([True, True], mask=[False, True]),
+}
 # Z, I and episode_starts of a batch.
 ROWS = np.array([[0.0, 1.0], [2.0, 3.0], [1.0, 2.0]])
 BATCHES = {
@@ -37,6 +43,7 @@ BATCHES = {
     "action too low": (ROWS, [0, -2, 1], [], ValueError, "row 1 is -2; .*0 to 2, and -1 for none"),
     "start beyond": (ROWS, [0, 0, 0], [0, 3], ValueError, "episode_starts names row 3.* 3 rows"),
     "numbers as starts": (ROWS, [0, 0, 0], [0.0], TypeError, "episode_starts .*float64.*row"),
+    "masked actions": (ROWS[:2], HIDDEN["whole numbers"], [], TypeError, "actions .*masked"),
     "flags as starts": (ROWS, [0] * 3, [True, False, False], TypeError, "episode_starts .*bool"),
 }
 
@@ -88,10 +95,16 @@ def test_a_batch_that_cannot_be_right(machine, Z, I, starts, error, words):
     refuses(machine, lambda m: m.learn_many(Z, I, starts), error, words)
 
 
-def test_failures_of_a_batch_that_cannot_be_right(grown):
-    for failures, error in (([0, 3], ValueError), ([-1], ValueError), ([True] * 3, TypeError)):
-        words = "failures (names row|has dtype bool)"
-        refuses(grown, lambda m, rows=failures: m.learn_many(ROWS, [0] * 3, [], rows), error, words)
+@pytest.mark.parametrize(
+    ("failures", "error", "words"),
+    [
+        *((rows, ValueError, "failures names row") for rows in ([0, 3], [-1])),
+        ([True] * 3, TypeError, "failures has dtype bool"),
+        (HIDDEN["whole numbers"], TypeError, "failures .*masked"),
+    ],
+)
+def test_failures_of_a_batch_that_cannot_be_right(machine, failures, error, words):
+    refuses(machine, lambda m: m.learn_many(ROWS, [0] * 3, [], failures), error, words)
 
 
 def test_a_failure_that_is_neither_true_nor_false(machine):
@@ -121,26 +134,9 @@ def test_a_setting_that_cannot_be_right(name, value):
         setattr(EvolvingFSM(2), name, value)
 
 
-# -- Masked arrays -----------------------------------------------------------------------------
-
-
-HIDDEN = {
-    "numbers": np.ma.array([0.5, 7.0], mask=[False, True]),
-    "whole numbers": np.ma.array([1, 7], mask=[False, True]),
-    "flags": np.ma.array([True, True], mask=[False, True]),
-}
-
-
 @pytest.mark.parametrize("z", HIDDEN.values(), ids=HIDDEN)
 def test_a_masked_entry_is_treated_as_nan_is(grown, z):
     twin = grown.copy()
     step = grown.observe(z, partial=True)
     expected = twin.observe([float(z[0]), NAN], partial=True)
     assert step.belief.tobytes() == expected.belief.tobytes()
-
-
-def test_a_masked_action_or_row_number_is_refused(machine):
-    hidden = np.ma.array([0, 1], mask=[False, True])
-    refuses(machine, lambda m: m.learn_many(ROWS[:2], hidden), TypeError, "actions .*masked")
-    words = "failures .*masked"
-    refuses(machine, lambda m: m.learn_many(ROWS[:2], [0, 0], [], hidden), TypeError, words)
