@@ -20,13 +20,8 @@ _ON_DATA = [
     *("shuffle_features_no_impact", "bounded_memory_growth"),
 ]
 
-
-def walk(rows=120, variables=3):
-    return np.random.default_rng(5).normal(size=(rows, variables)).cumsum(axis=0)
-
-
-def as_features(Z, names=("a", "b", "c")):
-    return [x for x, _ in stream.iter_array(Z, feature_names=list(names))]
+Z = np.random.default_rng(5).normal(size=(120, 3)).cumsum(axis=0)
+FEATURES = [x for x, _ in stream.iter_array(Z, feature_names=["a", "b", "c"])]
 
 
 def test_rivers_checks_pass():
@@ -42,28 +37,26 @@ def test_rivers_checks_on_data_pass_as_well(name):
 
 @pytest.mark.parametrize("settings", [{"radius": 0.5}, {"rule": Novelty(1.5)}])
 def test_it_learns_what_the_machine_learns(settings):
-    Z = walk()
     machine = EvolvingFSM(1, **settings)
     trace = machine.learn_many(Z, np.zeros(len(Z), np.int64), belief=True)
     clusterer = RiverClusterer(**settings)
     learnt = []
-    for x in as_features(Z):
+    for x in FEATURES:
         clusterer.learn_one(x)
         learnt.append(clusterer.predict_one(x))
     assert trace.n_states[-1] > 2
     assert learnt == trace.state.tolist()
     assert np.array_equal(clusterer.machine.transition_matrices, machine.transition_matrices)
-    of_last = list(clusterer.predict_proba_one(as_features(Z)[-1]).values())
+    of_last = list(clusterer.predict_proba_one(FEATURES[-1]).values())
     assert np.allclose(of_last, trace.belief[-1], atol=1e-12)
 
 
 @pytest.mark.parametrize("absent", [{}, {"b": None}, {"b": math.nan}])
 def test_what_is_absent_was_not_observed(absent):
-    Z = walk()
     machine = EvolvingFSM(1)
     machine.learn_many(Z, np.zeros(len(Z), np.int64))
     clusterer = RiverClusterer()
-    for x in as_features(Z):
+    for x in FEATURES:
         clusterer.learn_one(x)
     step = machine.observe([0.5, np.nan, -1.0], partial=True)
     x = {"a": 0.5, "c": -1.0, **absent}
@@ -76,7 +69,7 @@ def test_what_is_absent_was_not_observed(absent):
     # A transition from it is learnt again, under the one action there is.
     machine.act(0)
     machine.observe(Z[0])
-    clusterer.learn_one(as_features(Z[:1])[0])
+    clusterer.learn_one(FEATURES[0])
     assert np.array_equal(clusterer.machine.transition_matrices, machine.transition_matrices)
 
 
@@ -92,7 +85,7 @@ def test_features_that_are_named_wait_for_a_whole_observation_and_others_are_lef
 
 def test_rivers_metrics_of_clusterers_score_it():
     clusterer = RiverClusterer(rule=Novelty(1.5))
-    rows = [(x, None) for x in as_features(walk())]
+    rows = [(x, None) for x in FEATURES]
     score = evaluate.progressive_val_score(rows, clusterer, metrics.Silhouette())
     assert 0.0 < score.get() < 1.0
     centers = [list(one.values()) for one in clusterer.centers.values()]
