@@ -62,21 +62,17 @@ def whole():
 # -- What is written is read ---------------------------------------------------------------------
 
 
-def test_what_was_written_is_read_again_bit_for_bit(tmp_path):
+def test_what_was_written_who_wrote_it_and_from_what_is_read_again_bit_for_bit(tmp_path):
+    provenance = {"files": [{"name": "drive.csv", "bytes": 12}], "rows": 40}
     for place in (tmp_path / "file", str(tmp_path / "file"), io.BytesIO()):
-        write(place)
+        store.write(place, DRAWS, SETTINGS, arrays(), provenance)
+        header = store.read_header(place)
+        assert header == ("draws", 1, __version__, SETTINGS, provenance)
         settings, found = store.read(place, DRAWS)
         assert settings == SETTINGS
         for name, array in arrays().items():
             assert (found[name].dtype, found[name].shape) == (array.dtype, array.shape)
             assert found[name].tobytes() == array.tobytes()
-
-
-def test_a_file_says_what_it_holds_who_wrote_it_and_what_it_learnt_from(tmp_path):
-    provenance = {"files": [{"name": "drive.csv", "bytes": 12}], "rows": 40}
-    store.write(tmp_path / "file", DRAWS, SETTINGS, arrays(), provenance)
-    header = store.read_header(tmp_path / "file")
-    assert header == ("draws", 1, __version__, SETTINGS, provenance)
 
 
 def test_the_libraries_of_safetensors_can_read_a_file(whole):
