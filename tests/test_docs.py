@@ -207,11 +207,20 @@ def methods(cls):
                     yield name, method
 
 
-def missing(thing):
-    """Sections that the docstring of a class, function or method lacks, or leaves empty.
+PUBLIC = {name: getattr(evofsm, name) for name in evofsm.__all__}
+DOCUMENTED = PUBLIC | {
+    f"{owner}.{name}": method
+    for owner, cls in PUBLIC.items()
+    if inspect.isclass(cls)
+    for name, method in methods(cls)
+}
 
-    What it returns stands in its first line, with the shape. A method may leave its example to its
-    class, and tell there of the one thing that it is given.
+
+@pytest.mark.parametrize("thing", DOCUMENTED.values(), ids=DOCUMENTED)
+def test_a_public_name_has_its_sections_and_an_example(thing):
+    """What it returns stands in the first line of its docstring, with the shape.
+
+    A method may leave its example to its class, and tell there of the one thing that it is given.
     """
     is_method = not inspect.isclass(thing) and "." in thing.__qualname__
     lacks = set() if is_method else {"Examples"}
@@ -222,21 +231,7 @@ def missing(thing):
     lacks -= set(re.findall(r"^([A-Z]\w+)\n-+$", text, re.MULTILINE))
     if not (is_method or doctest.DocTestParser().get_examples(text)):
         lacks.add("Examples")
-    return lacks
-
-
-PUBLIC = {name: getattr(evofsm, name) for name in evofsm.__all__}
-DOCUMENTED = PUBLIC | {
-    f"{owner}.{name}": method
-    for owner, cls in PUBLIC.items()
-    if inspect.isclass(cls)
-    for name, method in methods(cls)
-}
-
-
-@pytest.mark.parametrize("name", DOCUMENTED)
-def test_a_public_name_has_its_sections_and_an_example(name):
-    assert not missing(DOCUMENTED[name])
+    assert not lacks
 
 
 # -- The glossary ---------------------------------------------------------------------------------
@@ -351,7 +346,6 @@ def test_links_between_files_lead_somewhere(page):
 
 # -- The closed loop -------------------------------------------------------------------------------
 
-CLOSED_LOOP = (ROOT / "docs" / "closed-loop.md").read_text("utf-8")
 RESULTS = json.loads((ROOT / "docs" / "results" / "emergency.json").read_text())
 
 
@@ -384,7 +378,7 @@ def test_the_closed_loop_table_is_what_the_study_printed():
 def test_the_bold_row_is_rebuilt_in_ten_lines():
     from studies.closed_loop import OURS, ClosedLoop, _test_learner
 
-    blocks = re.findall(r"```pycon\n(.*?)```", CLOSED_LOOP, re.DOTALL)
+    blocks = re.findall(r"```pycon\n(.*?)```", (DOCS / "closed-loop.md").read_text("utf-8"), re.S)
     (block,) = [block for block in blocks if "try_out(" in block]
     lines = [line[4:] for line in block.splitlines() if line.startswith(">>> ")]
     assert len(lines) <= 10

@@ -77,8 +77,6 @@ def test_a_face_offers_each_name_once_in_order_and_no_module_hides_it(face):
 # -- What is told of it ------------------------------------------------------------------------
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-
-
 TOLD = {
     "CITATION.cff": r"^version: (.+)$",
     "recipe/recipe.yaml": r'^  version: "(.+)"$',

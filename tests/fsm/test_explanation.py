@@ -229,10 +229,9 @@ def test_who_fails_after_a_sensor_fell_silent_has_failed(horizon, blind):
 # -- How often something begins, and how well that is known ----------------------------------------
 
 
-CASES = [(0, 1), (1, 3), (5, 5), (7, 10), (19, 4000), (30, 60), (1000, 4000)]
-
-
-@pytest.mark.parametrize(("count", "of"), CASES)
+@pytest.mark.parametrize(
+    ("count", "of"), [(0, 1), (1, 3), (5, 5), (7, 10), (19, 4000), (30, 60), (1000, 4000)]
+)
 def test_intervals_of_shares_and_of_counts_are_those_of_beta_and_gamma_distributions(count, of):
     exact = stats.beta.ppf([0.05, 0.95], [count, count + 1], [of - count + 1, of - count])
     share, near = np.nan_to_num(exact, nan=count / of), 1e-9 if count < 20 else 0.011

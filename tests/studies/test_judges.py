@@ -13,8 +13,6 @@ from studies.systems import Start, make_system
 
 from evofsm.guard.learnt import model
 
-PAGE = Path(__file__).parents[2] / "docs" / "judges.md"
-
 
 class Timid(Rival):
     """Always the lowest action once it has seen a failure; it writes down what it is told."""
@@ -130,7 +128,7 @@ def test_what_a_judge_executes_is_an_action(wrong):
 
 @pytest.mark.slow
 def test_the_task_and_the_judge_of_the_page_are_tried(tmp_path, monkeypatch):
-    page = PAGE.read_text("utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "judges.md").read_text("utf-8")
     for name, text in re.findall(r"```python\n# (\w+\.py)\n(.*?)```", page, re.S):
         (tmp_path / name).write_text(text, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
