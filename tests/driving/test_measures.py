@@ -135,23 +135,17 @@ def test_pfs_falls_from_the_unsafe_to_the_safe_distance():
     assert pfs == pytest.approx([1.0, 1.0, 0.5, 0.1 / 12.0, 0.0, 0.0, 1.0, 1.0])
 
 
-def test_cfs_falls_from_what_hard_to_what_comfortable_braking_needs():
+def test_cfs_falls_from_what_hard_to_what_comfortable_braking_needs_and_trusts_the_latter():
     # 10 m of reaction, then 10 m or 12.5 m of braking.
     gaps = np.array([19.0, 20.0, 21.0, 22.5, 30.0])
     rows = np.column_stack([gaps, np.full(5, 20.0), np.full(5, 10.0)])
     assert FuzzySafety(1.0, 4.0, 5.0).critical(rows, DT).tolist() == [1.0, 1.0, 0.6, 0.0, 0.0]
-
-
-def test_cfs_trusts_braking_that_is_under_way_up_to_the_comfortable():
-    # Braking by 3 m/s², 2 m/s too fast: 2²/6 m are needed.
+    # Braking that is under way is trusted: by 3 m/s², 2 m/s too fast, 2²/6 m are needed.
     rows = np.array([[9.0, 13.0, 8.0], [0.7, 10.0, 8.0], [0.6, 7.0, 5.0]])
     assert FuzzySafety(1.0, 4.0, 5.0).critical(rows, 1.0)[1:].tolist() == [0.0, 1.0]
-    # Braking by 8 m/s², taken for 4 m/s²: from 10 to 6 m/s in 8 m, then 36/10 or 36/8 m.
+    # Up to the comfortable: 8 m/s² are taken for 4 m/s²; from 10 to 6 m/s in 8 m, then 36/10 or 36/8 m.
     rows = np.array([[99.0, 28.0, 10.0], [12.05, 20.0, 10.0]])
     assert FuzzySafety(1.0, 4.0, 5.0).critical(rows, 1.0)[1] == pytest.approx(0.45 / 0.9)
-
-
-# -- Dead ends --------------------------------------------------------------------------------
 
 
 @settings(max_examples=500)
