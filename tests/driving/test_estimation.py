@@ -165,13 +165,11 @@ def test_a_leaders_braking_is_measured_well_in_spite_of_noise(decel):
 # -- Where one is -----------------------------------------------------------------------------
 
 
-def traffic(decisions, seed=0):
-    """Truth of a follower behind a leader in waves: observations, and what was done after each."""
-    rng = np.random.default_rng(seed)
-    rows, done = [], []
-    gap, speed, leader = 40.0, 15.0, 15.0
-    leads = 0.0
-    for k in range(decisions):
+def test_estimates_are_better_than_observations_and_know_how_good_they_are():
+    """Of a follower behind a leader in waves, whose truth is driven first."""
+    rng, rows, done = np.random.default_rng(0), [], []
+    gap, speed, leader, leads = 40.0, 15.0, 15.0, 0.0
+    for k in range(2000):
         if k % 16 == 0:
             leads = rng.uniform(-3.0, 1.5) if leader > 12.0 else rng.uniform(0.5, 2.0)
         does = float(np.clip(0.1 * (gap - 2.0 * speed) + 0.8 * (leader - speed), -2.5, 2.0))
@@ -180,11 +178,7 @@ def traffic(decisions, seed=0):
         reached, led = max(speed + does * DT, 0.0), max(leader + leads * DT, 0.0)
         gap += 0.5 * DT * (leader + led - speed - reached)
         speed, leader = reached, led
-    return np.array(rows), done
-
-
-def test_estimates_are_better_than_observations_and_know_how_good_they_are():
-    rows, done = traffic(2000)
+    rows = np.array(rows)
     seen = rows + np.random.default_rng(1).normal(scale=NOISE, size=rows.shape)
     seen[:, 1:] = np.maximum(seen[:, 1:], 0.0)
     perception, before = Perception(DT), [0.0, *done[:-1]]
