@@ -194,7 +194,7 @@ def test_commands_that_are_not_run_would_be_understood():
     assert looked_at > 40
 
 
-# -- Docstrings ----------------------------------------------------------------------------------
+# -- Docstrings and the glossary -----------------------------------------------------------------
 
 
 def methods(cls):
@@ -233,8 +233,6 @@ def test_a_public_name_has_its_sections_and_an_example(thing):
         lacks.add("Examples")
     assert not lacks
 
-
-# -- The glossary ---------------------------------------------------------------------------------
 
 WORDS = [row for row in (DOCS / "glossary.md").read_text().splitlines() if row.startswith("| **")]
 

@@ -457,7 +457,7 @@ def test_who_comes_towards_one_is_measured_with_a_negative_speed(road):
     assert watch.ttc[0] < 3.0
 
 
-# -- What is refused -------------------------------------------------------------------------------
+# -- What is refused, and which vehicles are meant -------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -474,9 +474,6 @@ def test_who_comes_towards_one_is_measured_with_a_negative_speed(road):
 def test_what_cannot_be_is_refused(road, options, given, said):
     with pytest.raises(ValueError, match=said):
         attach(road(*options), "all", **given)
-
-
-# -- Which vehicles are meant ---------------------------------------------------------------------
 
 
 IDS = [str(k) for k in range(2000)]

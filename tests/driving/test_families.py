@@ -122,9 +122,6 @@ def test_a_draw_that_is_none_is_refused():
             LOADED["emergency"].draw(*which)
 
 
-# -- Variants, shifts, switches -------------------------------------------------------------------
-
-
 def test_switches_are_on_before_and_after_a_shift():
     body = load_family("shift+jerk").shifted.draw(0, 0).scenario.body
     assert body == replace(LOADED["shift"].shifted.draw(0, 0).scenario.body, jerk=15.0)

@@ -309,9 +309,6 @@ def test_a_risk_that_saw_jumps_and_odd_numbers_is_kept_and_read_again(snapshot, 
         assert snapshot(reloaded(risk)) == snapshot(risk)
 
 
-# -- By state ---------------------------------------------------------------------------------
-
-
 def test_states_are_judged_at_their_centres():
     machine = EvolvingFSM(n_actions=1, rule=Novelty(radius=1.0, scales=(4.0, 2.0, 2.0)))
     machine.learn_many([[80.0, 5.0, 5.0], [3.0, 25.0, 25.0]], [0, 0])

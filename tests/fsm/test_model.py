@@ -39,9 +39,6 @@ def test_parts_that_do_not_fit_each_other_are_refused(grown, change, words):
         dataclasses.replace(grown.model(), **change)
 
 
-# -- Recognition -------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("z", "words"),
     [

@@ -103,7 +103,7 @@ def test_what_is_no_run_and_no_list_is_refused_by_name(tmp_path, name, text, sai
         list(read_runs([tmp_path / (name if name[0] == "a" else "a.csv")]))
 
 
-# -- What is asked --------------------------------------------------------------------------------
+# -- What is asked and learnt, and how it is judged -----------------------------------------------
 
 
 def test_what_is_under_way_or_not_known_is_no_case():
@@ -114,9 +114,6 @@ def test_what_is_under_way_or_not_known_is_no_case():
     assert known.tolist() == [True, True, True, False, False, False, False]
     came, known = coming(np.array([False, False, True]), 5)  # known, though the end is near
     assert (came & known).tolist() == [True, True, False]
-
-
-# -- What is learnt, and how it is judged ---------------------------------------------------------
 
 
 def test_every_question_is_put_to_every_measure_and_rows_hold_what_they_say(rows, folder):

@@ -78,7 +78,7 @@ def test_acc_is_the_published_one():
     assert held.interval == pytest.approx(0.1)
 
 
-# -- Rivals ---------------------------------------------------------------------------------------
+# -- Rivals and the ceiling ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -97,9 +97,6 @@ def test_judges_that_are_told_the_equations_save_and_come_close(task, controller
     assert row["score"] >= returns
     assert row["kept"] > 0.1
     assert row["told"] in ("dynamics and noise", "linear model and limits")
-
-
-# -- The ceiling ---------------------------------------------------------------------------------
 
 
 def test_the_ceiling_keeps_from_failing_and_keeps_what_does_no_harm(monkeypatch, tmp_path):
