@@ -1,7 +1,6 @@
 import os
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 
 import pytest
@@ -89,16 +88,10 @@ guard.decide(z, 0)
 
 
 @pytest.mark.slow
-def test_who_is_warm_compiles_no_more():
+@pytest.mark.parametrize("disable", ["0", "1"])  # as projects set it for their tests, or to debug
+def test_who_is_warm_or_runs_in_python_compiles_no_more(disable, tmp_path):
     """Not after a first failure either, where nobody expects to wait."""
-    fresh = {**os.environ, "NUMBA_CACHE_DIR": tempfile.mkdtemp()}
-    command = [sys.executable, "-c", WARMED]
+    fresh = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "NUMBA_DISABLE_JIT": disable}
+    command = [sys.executable, "-W", "error", "-c", WARMED]
     finished = subprocess.run(command, env=fresh, capture_output=True, text=True, check=True)
     assert finished.stdout == ""
-
-
-@pytest.mark.slow
-def test_without_a_compiler_all_runs_in_python():
-    """As projects set it for their tests, to debug or to measure coverage."""
-    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
-    subprocess.run([sys.executable, "-W", "error", "-c", WARMED], env=environment, check=True)
