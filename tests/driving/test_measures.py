@@ -143,7 +143,7 @@ def test_cfs_falls_from_what_hard_to_what_comfortable_braking_needs_and_trusts_t
     # Braking that is under way is trusted: by 3 m/s², 2 m/s too fast, 2²/6 m are needed.
     rows = np.array([[9.0, 13.0, 8.0], [0.7, 10.0, 8.0], [0.6, 7.0, 5.0]])
     assert FuzzySafety(1.0, 4.0, 5.0).critical(rows, 1.0)[1:].tolist() == [0.0, 1.0]
-    # Up to the comfortable: of 8 m/s² for 4 m/s²; from 10 to 6 m/s in 8 m, then 36/10 or 36/8 m.
+    # Braking by 8 m/s², taken for 4 m/s²: from 10 to 6 m/s in 8 m, then 36/10 or 36/8 m.
     rows = np.array([[99.0, 28.0, 10.0], [12.05, 20.0, 10.0]])
     assert FuzzySafety(1.0, 4.0, 5.0).critical(rows, 1.0)[1] == pytest.approx(0.45 / 0.9)
 

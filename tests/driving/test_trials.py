@@ -18,8 +18,6 @@ from evofsm.guard.api import Proposal
 from evofsm.guard.guard import Guard
 from evofsm.guard.reviser import ActionReviser, Mode
 
-pytestmark = pytest.mark.usefixtures("compiled")
-
 ACTIONS = IntervalActions(low=-2.5, high=2.5, width=0.3, outside="clip")
 EMERGENCY = load_family("emergency")
 

@@ -135,15 +135,12 @@ def test_both_worlds_agree_at_every_step(scenario, driver):
     assert len(closed_form.time) > 900 or scenario is not FULL
 
 
-def test_a_cut_in_replaces_the_leader_at_its_time():
-    episode = KinematicWorld().run(FULL, lambda z: -1.0)
+def test_waves_then_the_brake_move_the_leader_whom_a_cut_in_replaces_at_its_time():
+    episode = KinematicWorld().run(FULL, SETTINGS.drivers[2])
     assert episode.observations[500, 0] == pytest.approx(9.0)
     assert episode.observations[500, 2] == 11.0
     assert episode.observations[499, 2] != pytest.approx(11.0, abs=0.5)
-
-
-def test_waves_then_the_brake_move_the_leader():
-    accelerations = KinematicWorld().run(FULL, SETTINGS.drivers[2]).leader_accelerations
+    accelerations = episode.leader_accelerations
     assert accelerations[0] == IDM_LEADER.propose(np.array([np.inf, 12.0, 0.0])).action
     assert (accelerations[100:300] == -2.0).all()
     assert (accelerations[300:800] == 1.5).all()
