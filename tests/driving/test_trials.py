@@ -47,9 +47,8 @@ def test_outcomes_compare_with_the_controller_alone():
 def test_what_cannot_be_driven_is_refused():
     with pytest.raises(ValueError, match="no judge 'wise'; there are kinematic, learnt"):
         guard_for_family(EMERGENCY, judge="wise")
-    scenario = EMERGENCY.draw(0, 0).scenario
     with pytest.raises(ValueError, match="nobody drives"):
-        drive(unrevised_guard(EMERGENCY), scenario)
+        drive(unrevised_guard(EMERGENCY), EMERGENCY.draw(0, 0).scenario)
     with pytest.raises(ValueError, match="no multiple of the simulation's step"):
         drive(guard_for_cars(-2.5, 2.5, interval=0.123), EMERGENCY.draw(0, 0))
 

@@ -77,14 +77,11 @@ def test_what_was_counted_of_a_merged_state_is_not_said_of_the_one_in_its_place(
     assert ours < 0.9 * jensen_shannon(now, then).mean()
 
 
-def test_steps_that_cannot_be_are_refused():
+def test_steps_and_questions_that_cannot_be_are_refused_and_change_nothing(taught, machine, walk):
+    Z, actions = walk
     for steps, why in (([], "one or more"), ([2, 2], "each once"), ([0], "a positive integer")):
         with pytest.raises(ValueError, match=why):
             Forecasts(n_actions=2, steps=steps)
-
-
-def test_questions_that_cannot_be_are_refused_and_change_nothing(taught, machine, walk):
-    Z, actions = walk
     before = matrix(taught, None, 1)
     with pytest.raises(ValueError, match="no horizon of 3 steps; there are 1, 5"):
         taught.predict(machine.belief, 0, 3)
