@@ -129,9 +129,7 @@ def test_what_cannot_be_explained_is_refused(machine, told, error, says):
 
 def untold():
     machine = EvolvingFSM(1, rule=Novelty(radius=1.0))
-    for _ in range(3):
-        machine.start_episode()
-        machine.learn_many([[0.0], [5.0]], [0, 0])
+    machine.learn_many([[0.0], [5.0]] * 3, [0] * 6, [0, 2, 4])
     machine.start_episode()
     return machine
 
