@@ -181,6 +181,8 @@ def simulate(
             until = clock.getTime() + seconds
             while clock.getTime() < until and clock.getMinExpectedNumber():
                 libsumo.simulationStep()
+            everyone.detach()  # else they go on in the next simulation
+            chosen.detach()
             libsumo.close()
         emergencies = log.read_text().count("performs emergency braking")
     told, of_chosen = everyone.summary(), chosen.summary()
