@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from os import PathLike
 from pathlib import Path
-from traceback import extract_tb
+from traceback import walk_tb
 from typing import Any, NamedTuple, SupportsIndex
 from zlib import crc32
 
@@ -562,10 +562,17 @@ def definitions_of(path: str | Path) -> Iterator[dict[str, Any]]:
     try:
         yield runpy.run_path(str(path))
     except Exception as error:
-        frames = [f for f in extract_tb(error.__traceback__) if f.filename == str(path)]
-        line = "".join(f", line {frame.lineno}, in {frame.name}" for frame in frames[-1:])
         kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
         text = str(error).removeprefix(f"{path}: ")
-        raise ValueError(f"{path}{line}: {kind}{text}") from error
+        raise ValueError(f"{line_of(error) or path}: {kind}{text}") from error
     finally:
         sys.path.remove(folder)
+
+
+def line_of(error: BaseException) -> str:
+    """Where in a file of one's own (`definitions_of`) an error came about; empty if elsewhere."""
+    place = ""
+    for step, line in walk_tb(error.__traceback__):
+        if step.f_globals.get("__name__") == "<run_path>":
+            place = f"{step.f_code.co_filename}, line {line}, in {step.f_code.co_name}"
+    return place

@@ -380,8 +380,7 @@ def _files(path: Path) -> Iterator[tuple[Path, bool]]:
                 with file.open("rb") as source, target.open("wb") as out:
                     zstandard.ZstdDecompressor().copy_stream(source, out)
                 file = target
-            log, index = Path(f"{file}-wal"), Path(f"{file}-shm")
-            if log.is_file() and log.stat().st_size and not index.exists():
+            if (log := _log_of(file)) and not Path(f"{file}-shm").exists():
                 # No recorder runs; SQLite would write an index beside the file, if it may.
                 copyfile(log, Path(folder) / log.name)
                 file = Path(copyfile(file, Path(folder) / file.name))
@@ -389,9 +388,14 @@ def _files(path: Path) -> Iterator[tuple[Path, bool]]:
                 yield file, stream.read(len(_MCAP)) == _MCAP
 
 
+def _log_of(file: Path) -> Path | None:
+    """What SQLite wrote last, and left beside its file, if it did."""
+    log = Path(f"{file}-wal")
+    return log if log.is_file() and log.stat().st_size else None
+
+
 def _of_sqlite(file: Path, wanted: Collection[str], there: set[str]) -> _Messages:
-    log = Path(f"{file}-wal")  # beside it, of what was written last; an immutable file has none
-    how = "mode=ro" if log.is_file() and log.stat().st_size else "immutable=1"
+    how = "mode=ro" if _log_of(file) else "immutable=1"  # which has no log
     with closing(sqlite3.connect(f"{file.absolute().as_uri()}?{how}", uri=True)) as bag:
         rows = bag.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
         there |= {topic for _, topic, *_ in rows}

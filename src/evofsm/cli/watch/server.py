@@ -18,7 +18,6 @@ from collections.abc import Callable
 from http import HTTPStatus
 from importlib.resources import files
 from threading import Event, Thread
-from traceback import walk_tb
 from typing import Any, NamedTuple, Self
 
 import msgspec
@@ -27,6 +26,7 @@ from evofsm.cli.show import plain, warn
 from evofsm.cli.watch.session import Session
 from evofsm.cli.watch.shown import Frame, Start
 from evofsm.cli.watch.words import introduce, tell
+from evofsm.driving.family import line_of
 from evofsm.extras import needs
 
 with needs("websockets", "watch", "the live page"):
@@ -118,12 +118,9 @@ class Player:
                 self._go_on()
             except Exception as error:
                 # Whoever looks on must learn why nothing moves any more.
-                text = f"{type(error).__name__}: {error}"
-                for step, line in walk_tb(error.__traceback__):
-                    if step.f_globals.get("__name__") == "<run_path>":  # a file of one's own
-                        place = f"{step.f_code.co_filename}, line {line}, in {step.f_code.co_name}"
-                        text = f"{place}: {type(error).__name__}: {error}"
-                self.fault, self._over = text, True
+                place = line_of(error)
+                self.fault = f"{place}{': ' * bool(place)}{type(error).__name__}: {error}"
+                self._over = True
                 warn(f"the run broke off: {self.fault}")
                 self._audience("clock", self._clock())
                 self._audience("failed", self.fault)
