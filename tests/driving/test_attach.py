@@ -387,6 +387,7 @@ def test_whoever_is_of_the_type_now_is_guarded_and_who_is_not_is_not(road):
     assert guards.ever == {"ego", "lead"}
 
 
+@pytest.mark.usefixtures("road")  # which closes it
 def test_a_car_that_sumo_teleports_begins_anew(tmp_path):
     cars = tmp_path / "cars.rou.xml"
     cars.write_text(

@@ -842,6 +842,7 @@ def attach(
     >>> with SumoWorld() as world, world.open(scenario) as road:  # or your own simulation
     ...     watch = attach(libsumo, "all", mode="watch")
     ...     road.advance(0.0, steps=25)
+    ...     watch.detach()
     >>> watch.looked
     50
     """
