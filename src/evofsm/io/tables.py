@@ -52,6 +52,13 @@ _FOREIGN = {
     b"\x89HDF": "is HDF5 (or a MAT-file of MATLAB 7.3); write its table as CSV or Parquet: pandas",
     b"#ROSBAG ": "is a bag of ROS 1; convert it: rosbags-convert --src FILE --dst FOLDER",
     b"LOGG": "is a CAN log of Vector (BLF); decode it to CSV: python-can, cantools",
+    b"TDSm": "is TDMS of LabVIEW; write its channels as CSV: npTDMS",
+    b"ULog\x01": "is a log of PX4 (ULog); write it as CSV: ulog2csv of pyulog",
+    b"\xa3\x95": "is a log of ArduPilot; write it as CSV: mavlogdump.py of pymavlink",
+    b"Obj\1": "is Avro; write it as CSV or Parquet: polars.read_avro",
+    b"ORC": "is Apache ORC; write it as Parquet: pyarrow",
+    b"\x80\4\x95": "is a pickle of Python, which may run anything; write its table as Parquet",
+    b"\x80\5\x95": "is a pickle of Python, which may run anything; write its table as Parquet",
     b"MDF ": "is a measurement in ASAM MDF (MF4); write it as Parquet or CSV: asammdf",
     b"ARROW1": "is an Arrow (Feather) file; write it as Parquet: "
     "polars.read_ipc('FILE').write_parquet('drive.parquet')",
@@ -63,6 +70,16 @@ _FOREIGN = {
     b"UnFinMF ": "is a measurement in ASAM MDF that was not finalized; write it as CSV: asammdf",
     b"[{": "is JSON; write its rows as CSV: polars.read_json('FILE').write_csv('drive.csv')",
     b"{": "is JSON; write its rows as CSV: polars.read_ndjson('FILE').write_csv('drive.csv')",
+}
+# And texts that are no tables.
+_NO_TABLE = {
+    rb"\(\d+\.\d+\) \w+ [0-9A-F]+#": "is a CAN log (candump); decode it to CSV: cantools",
+    rb"date .*\n\s*base (hex|dec)": "is a CAN log of Vector (ASC); decode it to CSV: "
+    "python-can, cantools",
+    rb"[$!][A-Z]{5},.*\*[0-9A-F]{2}\s": "holds sentences of NMEA 0183; write them as CSV: pynmea2",
+    rb"# (HELP|TYPE) \w+ \w": "is what Prometheus fetches; write its series as CSV, a column each",
+    rb"\w[^\s,=]*(,[^\s,=]+=[^\s,]+)* [^\s,=]+=[^,\n]+(,[^\s,=]+=[^,\n]+)*( \d{10,})?\n": "is line "
+    "protocol of InfluxDB; write it as CSV, with a column for each field",
 }
 _PROFILE = len(_MCAP) + 1 + 8 + 4  # of MCAP, behind the mark, an opcode and two lengths
 
@@ -126,14 +143,19 @@ def file_kind(path: str) -> Kind:
     if path.removesuffix(".gz").endswith(".osi"):
         return "osi"
     with Source(path) as source:
-        head = source.read(64).removeprefix(_BYTE_ORDER_MARK).lstrip()
+        head = source.read(4096).removeprefix(_BYTE_ORDER_MARK).lstrip()
         head, is_packed = re.sub(rb"\A\[\s+", b"[", head), source.is_packed
     if not head:
         raise ValueError(f"{path} is empty")
     if b'{"__metadata__"' in head:
         raise ValueError(f"{path} holds what was learnt, and is no log: evofsm inspect prints it")
-    if foreign := next((says for mark, says in _FOREIGN.items() if head.startswith(mark)), ""):
-        raise ValueError(f"{path} {foreign.replace('FILE', path)}")
+    foreign = [says for mark, says in _FOREIGN.items() if head.startswith(mark)]
+    if foreign := foreign or [says for text, says in _NO_TABLE.items() if re.match(text, head)]:
+        raise ValueError(f"{path} {foreign[0].replace('FILE', path)}")
+    tables = {*re.findall(rb"CREATE TABLE \W?(\w+)", head)}
+    if head.startswith(_SQLITE) and tables and b"topics" not in tables:
+        way = f"sqlite3 -header -csv {path} 'SELECT * FROM TABLE' > drive.csv"
+        raise ValueError(f"{path} is a database of SQLite, and no bag; write it as CSV: {way}")
     if is_packed and head.startswith((_PARQUET, _SQLITE, _MCAP)):
         raise ValueError(f"{path} is gzipped, and cannot be read so; unpack it: gzip -dk {path}")
     if head.startswith(_MCAP):
@@ -142,7 +164,7 @@ def file_kind(path: str) -> Kind:
     for mark, kind in marks.items():
         if head.startswith(mark):
             return kind
-    if b"\0" in head:
+    if b"\0" in head[:64]:  # further down it is a bad row
         cause = "an archive, binary data, or text in UTF-16?"
         raise ValueError(f"{path} is not text in UTF-8 ({cause})")
     return "csv"
