@@ -234,6 +234,15 @@ def test_a_guard_under_which_hardly_any_episode_reaches_its_goal_is_told_of():
     assert "itself" not in arms([(60, "", None)] * 15 + [(60, "e", None)] * 5, alone).spoiling
 
 
+def test_a_guard_that_refuses_nothing_while_episodes_fail_is_told_of():
+    harm = Harm()
+    for driven in ((30, 0, 30), (0, 30, 30), (30, 0, 30), (30, 0, 30)):
+        assert not harm.spoiling
+        harm = harm.after(driven, failed=True)
+    assert harm.spoiling == "refused nothing yet, though 3 episodes failed in which it could"
+    assert not harm.after((30, 0, 29), failed=True).spoiling
+
+
 def test_a_controller_of_which_much_more_is_kept_is_another_one_until_it_fails():
     harm = arms([(100, "", None)] * 9, [(30, "f", None)] * 3)  # of which nothing was kept
     assert not any(harm._replace(n_episodes=n).passing(learning=True) for n in (12, 13, 14))

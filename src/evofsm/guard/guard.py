@@ -401,10 +401,10 @@ class Guard:
         self.learn = False
         if why := self._why_passing():
             warnings.warn(f"this guard {why}: frozen so, proposals pass", stacklevel=3)
-        elif self._observing is not None and (why := self._observing.harm.spoiling):
-            warnings.warn(f"this guard {why}; learn on, or look at print(guard)", stacklevel=3)
         elif why := getattr(self.judge, "uncovered", ""):
             warnings.warn(f"{why}; it has to cover each kind (another unit?)", stacklevel=3)
+        elif self._observing is not None and (why := self._observing.harm.spoiling):
+            warnings.warn(f"this guard {why}; learn on, or look at print(guard)", stacklevel=3)
 
     def _why_passing(self) -> str:
         """Why proposals pass in the episode to come; empty where they need not."""

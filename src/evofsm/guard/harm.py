@@ -80,7 +80,7 @@ class Outcome(NamedTuple):
 #: told; and numbers.
 OUTCOMES = Numbers().of("h", 7)
 SETTINGS = {
-    **dict.fromkeys(("n_episodes", "changed", "moved"), COUNT),
+    **dict.fromkeys(("n_episodes", "changed", "idle", "moved"), COUNT),
     "refuses": bool,
     "ends": bool,
     **dict.fromkeys(("decided", "kept"), Numbers(least=0.0, most=COUNT.most)),
@@ -97,6 +97,7 @@ class Harm(NamedTuple):
     decided: float = 0.0  #: decisions of late in which it could refuse
     kept: float = 0.0  #: and of these those in which it did not
     changed: int = 0  #: the latest episode in which another controller seems to have come, or 0
+    idle: int = 0  #: failures of episodes in which it acted, if nothing was refused yet
     moved: int = 0  #: and after which the system moves otherwise
 
     @property
@@ -116,12 +117,14 @@ class Harm(NamedTuple):
 
     @property
     def spoiling(self) -> str:
-        """What is said of a guard that keeps hardly a proposal, or from ending well; or nothing."""
+        """What is said of a guard that keeps hardly a proposal, all, or from ending well."""
         arms = self.guarded, self.alone()
         (n, well), (n_alone, well_alone) = ((len(arm), sum(o.ended for o in arm)) for arm in arms)
         if min(n, n_alone) >= _CAREFUL and 2 * well * n_alone < well_alone * n:
             by_themselves = f"{well} of {n} guarded episodes, alone {well_alone} of {n_alone}"
             return f"keeps what it guards from ending by itself: {by_themselves}"
+        if self.idle >= _CAREFUL:
+            return f"refused nothing yet, though {self.idle} episodes failed in which it could"
         if self.decided < _FEWEST_DECISIONS or self.kept >= 0.05 * self.decided:
             return ""
         share = f"where it drives {self.kept / self.decided:.0%} of proposals pass"
@@ -262,7 +265,8 @@ class Harm(NamedTuple):
         n_acted, n_watched, n_kept = driven
         refuses, n = self.refuses or n_kept < n_acted, self.n_episodes + 1
         ends = self.ends or (ended and not failed)
-        now = self._replace(n_episodes=n, refuses=refuses, ends=ends)
+        idle = 0 if refuses else self.idle + (failed and n_acted > 0)
+        now = self._replace(n_episodes=n, refuses=refuses, ends=ends, idle=idle)
         fades = math.exp(-n_acted / _DECISIONS)
         if refuses:
             now = now._replace(

@@ -147,6 +147,15 @@ def test_who_decides_once_an_episode_is_told_that_nothing_is_learnt():
         assert "nothing was learnt: no episode had four observations before it failed" in text
 
 
+def test_of_failures_before_anything_was_seen_to_move_nothing_is_learnt():
+    guard, seen = Guard(low=-1, high=1, interval=0.1), 0.1 * np.sin(np.arange(40))
+    for number in range(12):
+        for z in [9.0] if number < 10 else seen:
+            reason = guard.decide([z], 0.1 * z).reason
+        guard.end(number < 10)
+    assert reason.startswith("10 failures, before four observations or")
+
+
 def test_told_what_failure_is_it_keeps_from_the_first_one(point):
     guard = point.guard(failed=lambda z: z[0] >= 1.0, shadow=False)
     assert sum(point.play(guard, k)[1] for k in range(6)) <= 1

@@ -32,10 +32,14 @@ _RAYS, _EDGE_HALVINGS, _DEEP = 64, 40, 0.05
 _RADII = tuple(0.1 * 1.3**k for k in range(20))
 
 
-def fails(state: State, z: Floats, episode: Episode, given: Given) -> State:
-    """Learn where it fails, and where it ends, of observations ``z`` (T + 1, m) of an episode."""
+def fails(state: State, z: Floats, episode: Episode, given: Given, *, moves: bool) -> State:
+    """Learn where it fails, and where it ends, of observations ``z`` (T + 1, m) of an episode.
+
+    Where it failed before anybody could see how it ``moves``, a given function alone says where.
+    """
     settings, function = state.settings, given.failed
-    failed = episode.failed and bool(np.isfinite(z[-1]).all())
+    is_told = moves or function is not None
+    failed = episode.failed and is_told and bool(np.isfinite(z[-1]).all())
     rows = z[:-1] if episode.failed else z
     rows = rows[np.isfinite(rows).all(1)]
     most, went_on = settings.max_failures, rows
@@ -81,8 +85,12 @@ def _explained(state: State, *, failed: bool) -> State:
     if len(bent):  # others come with other bent forms
         sides = sides[failure.among(sides, was[are_sides])]
     rows = np.concatenate([sides, bent])
-    is_told = not len(failures) or failure.inside(rows, failures).any(0).all()
-    if failed or not is_told:
+    was_told, is_told = (
+        failure.inside(table, failures).any(0) if len(failures) else np.ones(0, bool)
+        for table in (was, rows)
+    )
+    # Where most came by chance that takes long, and finds nothing.
+    if failed or (not is_told.all() and 2 * was_told.sum() >= len(failures)):
         rows = failure.explain(FAILS, failures, survival)
     rows = failure.counted(rows, failures, survival)
     ends, fatal = failure.saying(table, ENDS, CRASHES), failure.saying(table, FATAL)

@@ -568,9 +568,9 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         """Why nothing is refused."""
         if self.parts is None and self.state.n_failed:
             return words.NEVER_WHOLE
-        n_survived = len(self.state.survived)
+        n_seen, n_survived = len(self.state.failures), len(self.state.survived)
         is_given = self.failed is not None and self.state.n_episodes > 0
-        return words.no_threshold(self.state.n_failed, n_survived, is_given=is_given)
+        return words.no_threshold(self.state.n_failed, n_seen, n_survived, is_given=is_given)
 
     @property
     def told_by_experience(self) -> str:

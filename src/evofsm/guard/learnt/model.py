@@ -52,7 +52,10 @@ def are_jumps(z: Floats, unit: Floats) -> Flags:
 
 
 def without_glitches(z: Floats, unit: Floats) -> Floats:
-    """Observations (T, m), NaN where a variable jumped there and back within two rows."""
+    """Observations (T, m), NaN where a variable jumped there and back within two rows.
+
+    Not where that is how it moves: of two values, more than once; nor where most rows do so.
+    """
     if len(z) < 5:
         return z
     rows = np.pad(z, ((2, 2), (0, 0)), "reflect")
@@ -61,6 +64,10 @@ def without_glitches(z: Floats, unit: Floats) -> Floats:
     pace = np.maximum(moves, np.vstack([moves[1:], moves[-1:]]))
     bad = np.abs(z - around) > JUMP * np.maximum(unit, pace)
     bad[[0, -1]] = False
+    between = (z > np.fmin.reduce(z)) & (z < np.fmax.reduce(z))
+    bad &= between.any(0) | (bad.sum(0) < 2)
+    if 2 * bad.any(1).sum() > len(z):
+        return z
     return np.where(bad.any(1, keepdims=True), np.nan, z)
 
 

@@ -55,6 +55,8 @@ IF_NO_MORE = ", if no more than now is ever allowed"
 #: The same where there is but one action.
 NOBODY = "nobody acts"
 
+# Farther nobody needs to know how far it is; so it is where something hardly ever moved [steps].
+_FARTHEST = 1_000_000
 # Disturbances that are taken to be harder by a smaller factor are taken as they were.
 _HARDER = 1.05
 # Of more dead ends, those from where most failed are counted.
@@ -145,7 +147,7 @@ def lasting(backup: str, *, cut: bool) -> str:
     return f"no action passes; {backup} lasts longest"
 
 
-def no_threshold(n_failed: int, n_survived: int, *, is_given: bool) -> str:
+def no_threshold(n_failed: int, n_seen: int, n_survived: int, *, is_given: bool) -> str:
     """Why nothing is refused where no threshold is known."""
     if is_given:
         if not n_survived:
@@ -154,6 +156,10 @@ def no_threshold(n_failed: int, n_survived: int, *, is_given: bool) -> str:
     if not n_failed:
         return NO_FAILURE
     failures = counted(n_failed, "failure")
+    if not n_seen:
+        return (
+            f"{failures}, before four observations or with NaN in the last, so nothing is refused"
+        )
     return f"{failures} seen, but beyond no value that was survived, so nothing is refused"
 
 
@@ -303,5 +309,7 @@ def constant(values: Sequence[float]) -> str:
 
 def changes(size: float) -> str:
     """A distance to failure, in typical steps."""
+    if abs(size) > _FARTHEST:
+        return f"over {_FARTHEST:,} typical steps"
     text = f"{size:.2g}" if abs(size) < 100.0 else f"{size:,.0f}"
     return f"{text} typical step{'s' * (text != '1')}"
