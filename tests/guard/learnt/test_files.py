@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from evofsm import Guard, store
-from evofsm.guard import LearntRisk
+from evofsm.guard import LearntRisk, LearntSettings
 from evofsm.guard.guard import KIND as GUARD
 
 
@@ -46,6 +46,34 @@ def test_what_no_learning_could_have_left_is_refused(points, forge, tmp_path, ch
     forge(path, change)
     with pytest.raises(ValueError, match=why):
         LearntRisk.load(path)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "why"),
+    [
+        *(({name: 0}, name) for name in ("n_asked", "n_starts", "max_survived", "ahead")),
+        ({"n_mutants": -3}, "n_mutants of -3 cannot be right"),
+        ({"n_disturbances": 10.0}, "n_disturbances holds a fraction"),
+        ({"margin": np.nan}, "margin of nan"),
+        ({"margin": None}, "margin is None"),
+    ],
+)
+def test_settings_that_no_file_holds_are_refused_as_they_are_made(numbers, why):
+    with pytest.raises(ValueError, match=why):
+        LearntSettings(**numbers)
+
+
+def test_settings_and_seeds_that_are_taken_can_be_kept():
+    numbers = LearntSettings(margin=0, caution=0.0, tries=0, n_asked=np.int64(2), shy=np.float32(9))
+    LearntRisk(0.1, -1.0, 1.0, settings=numbers, seed=1 << 53).save(file := BytesIO())
+    again = LearntRisk.load(BytesIO(file.getvalue()))
+    assert (again.settings, again.seed) == (numbers, 1 << 53)
+
+
+@pytest.mark.parametrize("seed", [-1, 1 << 63, 1 << 128])
+def test_a_seed_that_no_file_holds_is_refused_as_the_guard_is_made(seed):
+    with pytest.raises(ValueError, match=rf"seed is {seed}; it must be from 0 to 2\*\*53"):
+        Guard(-1.0, 1.0, interval=0.1, seed=seed)
 
 
 def with_tolerance(value):

@@ -42,7 +42,7 @@ from evofsm.guard.learnt.motion import used_at
 from evofsm.guard.learnt.rollout import CUT_SHORT, Floats, Ints, search
 from evofsm.guard.learnt.state import KIND, Episode, Given, LearntSettings, Parts, State, unpacked
 from evofsm.guard.learnt.words import Remembered
-from evofsm.store import Place
+from evofsm.store import MOST_COUNTED, Place
 
 # Rows of an episode that are learnt from before it ends.
 _MOST_ROWS = 1024
@@ -153,7 +153,9 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         if steps is not None and steps > _MAX_STEPS:
             most = f"a learnt judge looks at most {_MAX_STEPS:,} ahead (is it in seconds?)"
             raise ValueError(f"horizon is {horizon:g} s, {steps:,} decisions of {dt:g} s; {most}")
-        self.seed = operator.index(seed)
+        if not 0 <= (index := operator.index(seed)) <= MOST_COUNTED:
+            raise ValueError(f"seed is {seed}; it must be from 0 to 2**53, as files hold it")
+        self.seed = index
         self.model = function("model", model, "lambda z, u: z + 0.1 * u")
         self.backup = function("backup", backup, "lambda z: -1.0")
         if isinstance(names, str) or not all(isinstance(name, str) for name in names):

@@ -12,7 +12,7 @@ from evofsm.guard.harm import OUTCOMES, SETTINGS
 from evofsm.guard.learnt import failure, model, rollout
 from evofsm.guard.learnt.failure import HELD, ONE, OTHER, SAYS, B, I, J, Survived
 from evofsm.guard.learnt.rollout import CRASHES, ENDS, FAILS, FATAL, Floats, Model
-from evofsm.store import COUNT, FROM_1, SHARE, SIZE, SMALLEST, Kind, Numbers
+from evofsm.store import COUNT, FROM_1, SHARE, SIZE, Kind, Numbers
 
 #: From an observation and an encoded action (a,) to the observation a decision later.
 Move = Callable[[Floats, Floats], Floats]
@@ -20,6 +20,10 @@ Move = Callable[[Floats, Floats], Floats]
 # What files hold of a field: observations, what is not negative, and ends that may be infinite.
 _SEEN, _ABOVE_0 = Numbers(least=-1e30, most=1e30), Numbers(least=0.0)
 _BOUNDS = Numbers(least=-np.inf, most=np.inf)
+# Settings of which 0 would be none left to draw from, or to divide by; and numbers of steps.
+_Some = Annotated[int, FROM_1._replace(most=1e6)]
+_Size = Annotated[float, SIZE]
+_Steps = Annotated[int, FROM_1._replace(most=1e4)]
 
 
 @dataclass(frozen=True)
@@ -27,18 +31,18 @@ class LearntSettings:
     """Numbers of the learnt judge.
 
     They were chosen on the systems of the studies, with other draws than those that results are
-    given of.
+    given of. A ValueError names one that cannot be.
     """
 
     n_disturbances: int = 10  #: disturbances that are remembered
-    n_situations: int = 32  #: situations on which disturbances and backups are tried
-    n_asked: int = 3  #: backups that are asked in a decision; of more than 12 variables 2
+    n_situations: _Some = 32  #: situations on which disturbances and backups are tried
+    n_asked: _Some = 3  #: backups that are asked in a decision; of more than 12 variables 2
     n_linear: int = 3  #: linear backups
     n_mutants: int = 40  #: backups that are tried after an episode
     n_regulators: int = 4  #: and those beside them where actions are a box
-    n_starts: int = 100  #: steps of an episode in which a disturbance may begin, at most
-    max_failures: int = 200  #: observations in which it failed, of which it is learnt
-    max_survived: int = 8000  #: and that were survived: of more every second one is left out
+    n_starts: _Some = 100  #: steps of an episode in which a disturbance may begin, at most
+    max_failures: _Some = 200  #: observations in which it failed, of which it is learnt
+    max_survived: _Some = 8000  #: and that were survived: of more every second one is left out
     margin: float = 3.0  #: what has to be left of the distance to failure at first [typical steps]
     margin_max: float = 8.0  #: and at most
     margin_fade: float = 0.9  #: the share of the margin that is left an episode later
@@ -51,11 +55,11 @@ class LearntSettings:
     caution_max: float = 2.0  #: ... by so much at most, at first
     #: and after the system changed: a change half as large again as any there was has no sequel
     caution_again: float = 0.44
-    horizon: int = 64  #: how far it looks ahead at first [steps]
-    horizon_min: int = 32  #: at least
-    horizon_max: int = 144  #: at most
-    ahead: float = 1.5  #: it looks so many times as far as it takes to fail
-    latest: float = 0.98  #: of the time that it takes to fail, what is left an episode later
+    horizon: _Steps = 64  #: how far it looks ahead at first [steps]
+    horizon_min: _Steps = 32  #: at least
+    horizon_max: _Steps = 144  #: at most
+    ahead: _Size = 1.5  #: it looks so many times as far as it takes to fail
+    latest: _Size = 0.98  #: of the time that it takes to fail, what is left an episode later
     refuted: float = 0.8  #: and after one that went on from where nothing seemed to help
     tries: int = 8  #: an action that was used less often is tried ...
     alike: float = 0.02  #: ... where backups are alike up to such a share of the horizon
@@ -81,6 +85,11 @@ class LearntSettings:
     longer: float = 0.002  #: share of the horizon that who takes over has to last longer
     work: float = 7e6  #: products in the rollouts of a decision at most
     work_rate: float = 8.75e8  #: and in a second of the interval
+
+    def __post_init__(self) -> None:
+        for name, numbers in KIND.settings["settings"].items():
+            numbers.refuse_others(name, value := getattr(self, name))
+            object.__setattr__(self, name, np.asarray(value).item())  # as files hold it
 
 
 class Given(NamedTuple):
@@ -180,8 +189,8 @@ class State(NamedTuple):
     time_to_failure: Annotated[float, _ABOVE_0]  #: [steps]
     believed: Annotated[float, _ABOVE_0]  #: [steps]
     too_short: Annotated[float, _ABOVE_0]  #: [steps] before a failure that was certified not to be
-    horizon: Annotated[int, COUNT._replace(least=1.0, most=1e4)]  #: [steps]
-    stride: Annotated[int, COUNT._replace(least=1.0, most=1e4)]  #: decisions in a step
+    horizon: _Steps  #: [steps]
+    stride: _Steps  #: decisions in a step
 
     @classmethod
     def none(
@@ -366,7 +375,8 @@ _FIELDS = {
     for name, hint in get_type_hints(State, include_extras=True).items()
     if name != "settings"  # they stand beside it
 }
-_SETTING = {int: COUNT._replace(most=1e6), float: Numbers(least=SMALLEST)}
+_SETTING = {int: COUNT._replace(most=1e6), float: _ABOVE_0}
+_HINTS = get_type_hints(LearntSettings, include_extras=True).items()
 KIND = Kind(
     "learntrisk",
     {"harm": OUTCOMES, **{name: numbers for name, (_, numbers) in _FIELDS.items()}},
@@ -378,7 +388,7 @@ KIND = Kind(
         "seed": COUNT,
         **dict.fromkeys(("names", "units"), list[str]),
         "harm": SETTINGS,
-        "settings": {name: _SETTING[kind] for name, kind in get_type_hints(LearntSettings).items()},
+        "settings": {name: _SETTING.get(kind) or get_args(kind)[1] for name, kind in _HINTS},
     },
 )
 
