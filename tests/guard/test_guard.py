@@ -283,8 +283,10 @@ def test_frozen_it_learns_nothing_and_decides_the_same_again(make, snapshot):
 
 def test_a_copy_goes_its_own_way(make, snapshot):
     guard = make()
+    guard.valve = guard.machine.valve = threading.Lock()  # as a class of one's own adds
     balance(guard, pushes(make, 20))
     twin, bare = guard.copy(), guard.copy(states=False)
+    assert twin.valve is twin.machine.valve is bare.valve is guard.valve
     before = snapshot(guard)
     first = balance(twin, pushes(make, 20, 2), gusts=[0.19])[0]
     assert snapshot(guard) == before

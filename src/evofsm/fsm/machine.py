@@ -34,7 +34,7 @@ from evofsm.fsm.kernels import LINE, Entry, uncompiled
 from evofsm.fsm.model import FSMModel, believed
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.rules import StateRule
-from evofsm.fsm.sharing import Retraced, alone, share, step
+from evofsm.fsm.sharing import Retraced, alone, share, step, unshared
 from evofsm.fsm.step import EVENTS, PREDICTED, Event, Step, Trace, blank_trace
 from evofsm.fsm.transitions import room_for
 from evofsm.fsm.validation import Floats, positive, probability, whole
@@ -448,6 +448,7 @@ class EvolvingFSM(Retraced):
         return int(now["state"]) if now["chained"] else None
 
     savepoint = alone(Retraced.savepoint)
+    _twin = staticmethod(copy.copy)  # which has arrays of its own
 
     @alone
     def _become(self, again: Self) -> None:
@@ -494,7 +495,7 @@ class EvolvingFSM(Retraced):
     @alone
     def __getstate__(self) -> dict[str, Any]:
         learnt = [array.copy() for array in self._learnt]
-        return {"_rule": self._rule, "_settings": self._settings, "_learnt": learnt}
+        return {**unshared(self), "_learnt": learnt, "_known": None, "_one": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)

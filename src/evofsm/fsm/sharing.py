@@ -22,6 +22,11 @@ def share(shared: Any) -> None:
     shared._call = None  # what takes back a transaction under way
 
 
+def unshared(shared: Any) -> dict[str, Any]:
+    """What a copy gets of it, which has a lock of its own."""
+    return {name: value for name, value in vars(shared).items() if name not in ("_lock", "_call")}
+
+
 def alone(method: Method) -> Method:
     """A method of what is shared, during which no other thread changes it."""
 
@@ -68,15 +73,16 @@ class Retraced:
 
     _known: tuple[Any, list[tuple[Any, Any, Any]]] | None = None  # a copy, and the steps since
     _become: Callable[[Any], None]
+    _twin: Callable[[Any], Any] = staticmethod(deepcopy)
 
     def savepoint(self) -> Rollback:
         """What takes back all that it learns from now on."""
         if self._known is None:
-            self._known = deepcopy(self), []
+            self._known = self._twin(self), []
         (before, steps), count = self._known, len(self._known[1])
 
         def rollback() -> None:
-            again = deepcopy(before)
+            again = self._twin(before)
             for method, args, kwargs in steps[:count]:
                 method(again, *args, **kwargs)
             self._become(again)

@@ -25,7 +25,7 @@ from evofsm.fsm.machine import EvolvingFSM, opened
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import Labels, in_a_line
 from evofsm.fsm.rules import reach
-from evofsm.fsm.sharing import Rollback, alone, share, transaction
+from evofsm.fsm.sharing import Rollback, alone, share, transaction, unshared
 from evofsm.fsm.validation import function, number, positive, real_array, truth, usable_array
 from evofsm.guard.actions import (
     Action,
@@ -849,8 +849,8 @@ class Guard:
     # What another process gets has a lock of its own, and what it learns there stays there.
     @alone
     def __getstate__(self) -> dict[str, Any]:
-        state = {name: vars(self)[name] for name in vars(self) if name not in ("_lock", "_call")}
-        return state | {"audit": None, "process": None}  # an audit log is the file of this one
+        own = {"audit": None, "process": None}  # an audit log is the file of this one
+        return unshared(self) | own
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -873,14 +873,18 @@ class Guard:
         memo = {id(self.machine): machine}  # for a judge that asks the machine
         reviser, judge = copy.deepcopy((self.reviser, self.judge), memo)
         settings = {name: getattr(self, name) for name in (*_PLAIN_SETTINGS, "failed")}
-        return type(self).of(reviser, judge=judge, machine=machine if states else None, **settings)
+        machine = machine if states else None
+        twin = type(self).of(reviser, judge=judge, machine=machine, **settings)
+        vars(twin).update({**vars(self), **vars(twin)})  # with what a class of one's own adds
+        return twin
 
     @alone
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write all of it to one file: machine, judge and settings.
 
         An episode under way is not kept: whoever loads the file begins a new one. Neither are the
-        audit log and the function `failed`, which is code: `load` takes that again.
+        audit log, attributes that a class of your own adds, and the function `failed`, which is
+        code: `load` takes that again.
 
         Parameters
         ----------
