@@ -110,6 +110,13 @@ def test_at_equal_speed_some_are_blind_and_others_see():
         assert sees == (type(measure) not in blind)
 
 
+@pytest.mark.parametrize("measure", MEASURES)
+def test_nothing_calls_for_braking_on_a_free_road(measure):
+    free = np.array([[30.0, 20.0, 18.0], [np.inf, 20.0, 20.0], [np.inf, 20.0, 20.0]])
+    with np.errstate(all="raise"):
+        assert (measure.score(free, DT)[1:] <= 0.0).all()
+
+
 def test_mttc_solves_for_the_first_meeting():
     # Opening at 1 m/s, but 2 m/s² faster and faster: t² - t = 6.
     rows = np.array([[6.0, 10.0, 13.0], [6.0, 10.0, 11.0]])

@@ -113,7 +113,8 @@ def modified_time_to_collision(observations: Floats, dt: float) -> Floats:
     """
     gap, speed, leader_speed = _columns(observations)
     closing_speed = speed - leader_speed
-    radicand = closing_speed**2 + 2.0 * _acceleration(closing_speed, dt) * gap
+    ahead = np.where(np.isinf(gap), 0.0, gap)  # to where no one is ahead it takes for ever
+    radicand = closing_speed**2 + 2.0 * _acceleration(closing_speed, dt) * ahead
     # Gap over the mean closing speed until then: the first positive root, whatever the sign of Δa.
     mean = np.where(radicand < 0.0, 0, (closing_speed + np.sqrt(np.maximum(radicand, 0.0))) / 2)
     return _time_to_cover(gap, mean)
