@@ -404,6 +404,7 @@ def test_a_search_keeps_to_what_is_allowed():
         ({"low": -1.0, "high": 1.0, "judge": Balance}, "must be an object with a method judge"),
         ({"low": -1.0, "high": 1.0, "audit": "log.jsonl"}, "has no method decided"),
         ({"low": -1.0, "high": 1.0, "judge": None, "names": "ab"}, "names is 'ab'; it must be"),
+        ({"low": -1.0, "high": 1.0, "names": np.array(["a", "b"])}, "no names: leave them out"),
         ({"low": [0.0, 0.0], "high": [1.0], "judge": None}, "low has 2 components and high has 1"),
         ({"low": [0.0, 2.0], "high": [1.0, 2.0]}, "in component 1; low must be below high"),
         ({"low": [-math.inf], "high": [1.0]}, "low is .* must be finite"),
@@ -434,6 +435,17 @@ def test_settings_of_the_reviser_are_looked_at_where_they_are_set():
     unrevised = Guard.of(Unrevised(IntervalActions(-2.5, 2.5, 0.3)), interval=DT)
     with pytest.raises(AttributeError, match="Unrevised has no mode"):
         unrevised.mode = "shadow"
+
+
+def test_settings_of_a_guard_are_looked_at_where_they_are_set():
+    guard = Guard(-1.0, 1.0, interval=DT)
+    for name, value in (("failed", "terminated"), ("shadow", 0), ("explaining", "no")):
+        with pytest.raises(TypeError, match=f"^{name} is"):
+            setattr(guard, name, value)
+    with pytest.raises(AttributeError, match="interval"):
+        guard.interval = 0.5  # judge and machine would go on by the other
+    guard.failed = lambda z: z[0] > 1.0
+    assert guard.judge.failed(np.array([2.0]))  # which asks it around what was survived
 
 
 def test_a_reviser_for_another_interval_and_a_machine_of_other_actions_are_refused():

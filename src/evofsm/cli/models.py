@@ -33,7 +33,7 @@ def load_guard(path: store.Place) -> Guard:
     """A guard that learns no more: a function of failures that it knew is not asked."""
     guard = Guard.load(path, failed=lambda seen: False)
     if isinstance(guard.judge, LearntRisk):
-        guard.failed = guard.judge.failed = None  # it only stood in
+        guard.failed = None  # it only stood in
     return guard
 
 

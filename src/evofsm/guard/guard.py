@@ -131,6 +131,15 @@ def _of_reviser(name: str, doc: str) -> Any:
     return property(attrgetter(f"reviser.{name}"), change, doc=doc)
 
 
+def _truth(name: str, doc: str) -> Any:
+    """A setting that is True or False, and may be changed at any time."""
+
+    def change(guard: Guard, value: Any) -> None:
+        vars(guard)[f"_{name}"] = truth(name, value)
+
+    return property(attrgetter(f"_{name}"), change, doc=doc)
+
+
 class Guard:
     """Keeps any controller from failing: a state machine, a judge and a reviser that learn.
 
@@ -249,7 +258,7 @@ class Guard:
         if judge is None:
             settings = {"n_actions": n_actions, "horizon": horizon, "seed": seed, **arguments}
             judge = LearntRisk(interval, low, high, **settings)
-        elif any(arguments.values()):
+        elif model is not None or backup is not None or np.size(names):
             asks = "asks no model, no backup and no names: leave them out"
             raise ValueError(f"{type(judge).__name__} {asks}")
         machine = EvolvingFSM(
@@ -316,14 +325,13 @@ class Guard:
         n_episodes: int = 0,
         n_failed: int = 0,
     ) -> None:
-        function("failed", failed, "lambda z: z[0] <= 0")
         if not (audit is None or hasattr(audit, "decided")):
             raise TypeError(f"audit is {audit!r}, which has no method decided")
         share(self)
         #: In which it was made; None of what was copied as Python does, which learns for itself.
         self.process: int | None = os.getpid()
         self.actions = reviser.actions
-        self.interval = positive("interval", interval)
+        self._interval = positive("interval", interval)
         action_judge: Any = getattr(reviser, "risk", judge)
         if judge is None and isinstance(action_judge, LearningJudge):
             judge = action_judge
@@ -340,7 +348,6 @@ class Guard:
             counts = f"{machine.n_actions} actions, but the set has {self.actions.n_actions}"
             raise ValueError(f"the machine has {counts}")
         if isinstance(action_judge, LearntRisk):
-            action_judge.failed = None if failed is None else partial(asked, failed)
             action_judge.warm()
         if machine is not None:
             _warm_machine()
@@ -351,7 +358,7 @@ class Guard:
         self.judge = judge
         self.failed = failed
         self.audit: DecisionLogger | None = audit
-        self.explaining = truth("explaining", explaining)
+        self.explaining = explaining
         labels = Labels() if action_judge is None else action_judge.labels
         #: What the judge calls the variables of an observation; empty where it does not say.
         self.variables: tuple[str, ...] = labels.names
@@ -366,12 +373,29 @@ class Guard:
         self._under_way, self._passing, self._learn = False, "", True
         self._begun = self._decisions = self._acted = self._watched = self._kept = 0
         self._lacking = 0  # observations since one was whole
-        #: Whether proposals pass in some or all episodes where it was not shown to help.
-        self.shadow = truth("shadow", shadow)
+        self.shadow = shadow
         self.learn = learn
 
     mode = _of_reviser("mode", "How far its reviser goes, a `Mode`; may be changed at any time.")
     tolerance = _of_reviser("tolerance", "Highest risk that its reviser accepts, in (0, 1).")
+    explaining = _truth("explaining", "Whether the machine's experience is said of each decision.")
+    shadow = _truth("shadow", "Whether proposals pass in episodes where it was not shown to help.")
+
+    @property
+    def interval(self) -> float:
+        """Time between two decisions [s], of which all that it learns is."""
+        return self._interval
+
+    @property
+    def failed(self) -> Callable[[NDArray[np.float64]], bool] | None:
+        """From an observation to whether it is a failure; a learnt judge asks it, too."""
+        return self._failed
+
+    @failed.setter
+    def failed(self, failed: Callable[[NDArray[np.float64]], bool] | None) -> None:
+        self._failed = function("failed", failed, "lambda z: z[0] <= 0")
+        if isinstance(judge := getattr(self.reviser, "risk", self.judge), LearntRisk):
+            judge.failed = None if failed is None else partial(asked, failed)
 
     @property
     def learn(self) -> bool:
@@ -849,8 +873,8 @@ class Guard:
     # What another process gets has a lock of its own, and what it learns there stays there.
     @alone
     def __getstate__(self) -> dict[str, Any]:
-        own = {"audit": None, "process": None}  # an audit log is the file of this one
-        return unshared(self) | own
+        # An audit log is the file of this one.
+        return unshared(self) | {"audit": None, "process": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -957,7 +981,7 @@ class Guard:
             guard = cls.of(failed=failed, **parts, **plain)
             if isinstance(guard.judge, LearntRisk):
                 guard.judge.model, guard.judge.backup = model, backup
-            elif model or backup:
+            elif model is not None or backup is not None:
                 raise ValueError(f"{type(guard.judge).__name__} asks no model and no backup")
             return guard
 

@@ -60,6 +60,23 @@ def test_what_is_wrong_with_a_given_function_is_said_and_nothing_is_learnt(tmp_p
     assert "model was asked of [1.1 2. ], " in raised.value.__notes__[0]
 
 
+class Asked(dict):
+    """A function that remembers what it was asked: empty, and so false, at first."""
+
+    def __call__(self, z, u=0.0):
+        self[tuple(z)] = u
+        return move(z, u) if u else -1.0
+
+
+@pytest.mark.parametrize("name", ["model", "backup"])
+def test_a_function_that_is_false_as_an_object_is_asked_too(name):
+    guard = Guard(-1.0, 1.0, interval=0.1, **{name: Asked()})
+    for k in range(9):
+        guard.decide([1.0 + 0.1 * k, 2.0], 0.5)
+    guard.end(True, [2.0, 2.0])
+    assert getattr(guard.judge, name)
+
+
 @pytest.mark.parametrize("name", ["choices", "plane"])
 def test_a_given_backup_is_fitted_for_choices_and_for_many_numbers(points, name):
     def backup(z):
@@ -88,7 +105,7 @@ def test_a_function_that_covers_not_all_failures_is_said_to():
 
 
 def test_a_guard_says_variables_by_their_names():
-    guard = Guard(low=-1.0, high=1.0, interval=0.1, names=["angle", "speed"])
+    guard = Guard(low=-1.0, high=1.0, interval=0.1, names=iter(["angle", "speed"]))
     for k in range(4):
         guard.decide([0.1 * k, 1.0], 0.5)
     guard.end(failed=True, observation=[0.4, 1.0])

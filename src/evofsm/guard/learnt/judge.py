@@ -158,9 +158,11 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         self.seed = index
         self.model = function("model", model, "lambda z, u: z + 0.1 * u")
         self.backup = function("backup", backup, "lambda z: -1.0")
-        if isinstance(names, str) or not all(isinstance(name, str) for name in names):
-            raise TypeError(f"names is {names!r}; it must be a text for each variable")
-        self.labels = Labels(names=tuple(names), units=tuple(units), dt=self.dt)
+        texts = {"names": tuple(names), "units": tuple(units)}
+        for name, values in (("names", names), ("units", units)):
+            if isinstance(values, str) or not all(isinstance(text, str) for text in texts[name]):
+                raise TypeError(f"{name} is {values!r}; it must be a text for each variable")
+        self.labels = Labels(names=texts["names"], units=texts["units"], dt=self.dt)
         #: Number of actions; 0 where the action is a box.
         self.choices = 0 if n_actions is None else whole("n_actions", n_actions)
         if {low is None, high is None} != {n_actions is not None}:
@@ -524,7 +526,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
                 raise ValueError(f"backup gave {action} at {z}; it has to give an action")
             return self.encode(action[0] if self.choices else np.clip(action, self.low, self.high))
 
-        parts = self.failed, model if move else None, backup if act else None
+        parts = self.failed, None if move is None else model, None if act is None else backup
         return Given(self.seed, self.given_horizon, *parts)
 
     def _study(self, *, failed: bool, terminated: bool) -> None:
