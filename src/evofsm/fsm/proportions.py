@@ -30,7 +30,14 @@ def wilson_bounds(share: float, count: float, quantile: float = _QUANTILE) -> tu
         The share, in [0, 1], and of how many cases.
     quantile : float
         Of a standard normal variable, at the upper end; that of 90 % unless told otherwise.
+
+    Raises
+    ------
+    ValueError
+        If the share is none.
     """
+    if abs(share - 0.5) > 0.5 + 1e-6:  # with room for rounding
+        raise ValueError("share must lie between 0 and 1 (is it a count?)")
     spread = quantile * quantile / count
     centre = (share + 0.5 * spread) / (1.0 + spread)
     reach = math.sqrt(spread * (share * (1.0 - share) + 0.25 * spread)) / (1.0 + spread)
