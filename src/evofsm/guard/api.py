@@ -152,10 +152,8 @@ class ActionJudge(Protocol):
 
     #: What it calls the variables of an observation.
     labels: Labels
-
-    @property
-    def fallback(self) -> Fallback:
-        """What is done without a usable proposal."""
+    #: What is done without a usable proposal.
+    fallback: Fallback
 
     def judge(self, situation: Situation, actions: ArrayLike, /) -> Judgement:
         """How dangerous each action is."""

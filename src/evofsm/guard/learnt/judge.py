@@ -173,6 +173,10 @@ class LearntRisk(ObservingJudge, SearchingJudge):
             ends: Any = np.atleast_1d(low), np.atleast_1d(high)
             self.low, self.high = BoxActions(*ends).bounds
         self.middle, self.half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
+        self.fallback = Fallback(0.0, "the first action")  #: revised like any proposal
+        if not self.choices:
+            middle = self.middle if len(self.middle) > 1 else float(self.middle[0])
+            self.fallback = Fallback(middle, "the middle of the range")
         #: How many numbers an action has.
         self.size = self.choices or len(self.low)
         rollout.refuse_too_many(1, self.size, box=not self.choices)
@@ -216,14 +220,6 @@ class LearntRisk(ObservingJudge, SearchingJudge):
     def settings(self) -> LearntSettings:
         """Its numbers."""
         return self.state.settings
-
-    @property
-    def fallback(self) -> Fallback:
-        """What is done without a usable proposal, and then revised like any."""
-        if self.choices:
-            return Fallback(0.0, "the first action")
-        middle = self.middle
-        return Fallback(middle if len(middle) > 1 else float(middle[0]), "the middle of the range")
 
     def refuse_unfit(self, actions: ActionSet) -> None:
         """Raise for another range of actions than it learns of."""
