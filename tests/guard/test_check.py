@@ -78,6 +78,12 @@ class RiskInPercent(LatentRisk):
         return judged._replace(risk=100.0 * judged.risk, high=100.0 * judged.high)
 
 
+class ScalesInPlace(LatentRisk):
+    def judge(self, situation, actions):
+        actions *= 0.9
+        return super().judge(situation, actions)
+
+
 class LearnsFromQuestions(LatentRisk):
     asked = 0
 
@@ -138,6 +144,7 @@ BROKEN = {
         driver(lambda seen: seen.fill(0.0) or Proposal(0.0)),
         KeepsObservation,
         driver(lambda seen: Proposal(random.random())),
+        ScalesInPlace(-2.5),
     ],
     "judges_each_action": [RiskInPercent(-2.5)],
     "learns_only_from_what_happens": [LearnsFromQuestions(-2.5), LearnsFrozen(-2.5)],

@@ -6,6 +6,7 @@ import threading
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -344,13 +345,19 @@ def test_an_array_of_length_one_is_a_vector_but_for_a_number_as_policies_predict
 
 def test_of_a_vector_what_need_not_change_does_not_and_nobody_can_change_what_was_decided():
     wanted = np.array([0.9, 2.5])
-    revision = of_vectors().decide([0.2, 0.3], wanted)
+    guard = of_vectors()
+    revision = guard.decide([0.2, 0.3], wanted)
     wanted[:] = 9.0
     assert revision.proposed.tolist() == [0.9, 2.5]
     assert revision.executed[0] < 0.9
     assert revision.executed[1] == 2.5  # has no effect
     assert revision.risk_executed <= 0.02 < revision.risk_proposed
-    for one in (revision.proposed, revision.executed, revision.advised):
+    for one in (
+        revision.proposed,
+        revision.executed,
+        revision.advised,
+        guard.situation.observation,
+    ):
         with pytest.raises(ValueError, match="read-only"):
             one[0] = 0.0
 
@@ -370,7 +377,8 @@ def test_what_a_search_finds_outside_is_put_into_the_set():
 
 def test_a_search_keeps_to_what_is_allowed():
     class Bold(Balance):
-        def search(self, situation, wanted, **_):
+        def search(self, situation, wanted, *, mask, **_):
+            np.ravel(True if mask is None else mask)[:] = True  # which changes what it is asked
             return Search(np.array([wanted, 2.0]), self.judge(situation, [0, 2]), 1, "bold")
 
     guard = discrete(judge=Bold(index=True))
@@ -480,6 +488,29 @@ def test_what_is_refused_leaves_it_as_it_was(make, call, name, value, snapshot):
     said = [repr(getattr(one, call)(**usual)) for one in (guard, twin)]
     assert said[0] == said[1]
     assert snapshot(guard) == snapshot(twin)
+
+
+def test_functions_that_work_in_place_change_nothing_of_the_guard(snapshot):
+    def failed(z):
+        z -= 0.5
+        return abs(z[0]) > 1.0
+
+    def model(z, u):
+        z[0] += DT * u
+        return z
+
+    def backup(z):
+        return z.fill(0.0) or 1.0
+
+    told = {"failed": failed, "model": model, "backup": backup}
+    apart = {name: partial(lambda f, z, *u: f(z.copy(), *u), f) for name, f in told.items()}
+    guards = [Guard(-1.0, 1.0, interval=DT, **functions) for functions in (told, apart)]
+    for guard in guards:
+        for _ in range(2):
+            for k in range(20):
+                guard.decide([0.1 * k, 1.0], 1.0)
+            guard.end(observation=[2.0, 1.0])
+    assert snapshot(guards[0]) == snapshot(guards[1])
 
 
 def test_where_nothing_moves_before_it_fails_it_learns_all_the_same():

@@ -295,7 +295,7 @@ def test_what_does_not_fit_is_named():
             None,
             (3.0, 0.0, 1.0, 1.0, 0.0),
         ),
-        (Dict({"a": MultiDiscrete([9])}), {"a": [3]}, lambda given: given["a"], (3.0,)),
+        (Dict({"a": MultiDiscrete([9])}), {"a": [3]}, lambda given: given.pop("a"), (3.0,)),
     ],
 )
 def test_observations_become_a_vector(space, observation, observe, seen):
@@ -322,6 +322,7 @@ def test_observations_become_a_vector(space, observation, observe, seen):
         ({"failed": lambda step: step.info["of"] == "step"}, None, False, True),
         ({"failed": lambda step: step.reward == 1.5}, None, False, True),  # without the penalty
         ({"failed": lambda step: step.observation[0] > 0 and step.terminated}, None, True, True),
+        ({"failed": lambda step: bool(step.observation.clear())}, lambda z: z[0] < 0, True, False),
         ({"failed": lambda step: np.array([step.truncated])}, None, True, False),
     ],
 )

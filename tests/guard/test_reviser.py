@@ -51,6 +51,25 @@ def test_who_gives_no_judgement_is_named(risk):
         ActionReviser(judge, ACTIONS).revise(HERE, Proposal(1.0))
 
 
+@pytest.mark.parametrize("mode", [Mode.ACT, Mode.SHADOW])
+def test_what_a_judge_does_to_its_arrays_is_not_executed(mode):
+    class InPlace(Told):
+        def judge(self, situation, accelerations):
+            judged = super().judge(situation, accelerations)
+            accelerations *= 10.0
+            return judged
+
+        def choose(self, situation, options, *_):
+            options += 9.0
+
+    revisers = [ActionReviser(of(lambda a: a > 1.0), ACTIONS, mode=mode) for of in (Told, InPlace)]
+    for proposal in (Proposal(0.7), Proposal(2.0)):
+        one, other = (reviser.revise(HERE, proposal) for reviser in revisers)
+        assert one == other
+    revisers[1].risk.effective = lambda situation, actions: 10.0 * actions
+    assert revisers[1].revise(HERE, Proposal(-0.7)).advised in (LOW, -0.7)
+
+
 FOUND = Search(np.array([1.0, 2.0]), Judgement(*[np.zeros(2)] * 4, 1.0), 1, "found")
 
 

@@ -144,7 +144,8 @@ class Trial(NamedTuple):
 class ActionJudge(Protocol):
     """Anything that can be asked how dangerous an action is, whatever system it knows.
 
-    Actions come as a (k,) array, of `BoxActions` as a (k, d) one. One that knows what the variables
+    Actions come as a (k,) array, of `BoxActions` as a (k, d) one, its own to change; an observation
+    is read only. One that knows what the variables
     of an observation can be may say so as ``ranges``, (least, most) of each, of more in turn: a
     guard refuses all else. With ``lowest_first`` true the lowest of several actions that are least
     risky is taken, as cars brake; else the one closest to the proposal.

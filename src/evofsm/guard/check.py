@@ -219,7 +219,7 @@ def _actions(judge: Any) -> tuple[ActionSet, Floats]:
         samples = np.rint(samples) if isinstance(actions, Choices) else samples
         with suppress(Exception):
             (another := copy.deepcopy(judge)).refuse_unfit(actions)
-            another.judge(_situation(_drive(1, judge=judge)[0], 1), samples)
+            another.judge(_situation(_drive(1, judge=judge)[0], 1), samples.copy())
             break
     return actions, samples
 
@@ -240,14 +240,18 @@ def _go_on(guard: Guard, judge: Any, episodes: range, *, ask: bool = False) -> N
         rows, failed = _drive(seed=episode, judge=judge), episode % 2 == 0
         for k, row in enumerate(rows):
             if ask:
-                judge.why(judge.judge(_situation(row, 0), samples))
+                judge.why(judge.judge(_situation(row, 0), samples.copy()))
             guard.decide(row, samples[k % len(samples)], k * _DT)
         guard.end(failed, rows[-1])
 
 
 def _judgements(judge: Any, rows: Rows) -> Answers:
-    samples = _actions(judge)[1]
-    return [judge.judge(_situation(row, 1), samples.copy())[:3] for row in rows]
+    samples, judgements = _actions(judge)[1], []
+    for row in rows:
+        judgements.append(judge.judge(_situation(row, 1), options := samples.copy())[:3])
+        message = "it changed the actions that it was given (work in place? copy them first)"
+        _insist(_same(options, samples), message)
+    return judgements
 
 
 def _asked(judge: Any) -> Answers:

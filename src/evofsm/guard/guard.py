@@ -625,6 +625,7 @@ class Guard:
     def _checked(self, observation: ArrayLike) -> NDArray[np.float64]:
         """An observation that judge and machine can take in; NaN stays."""
         z = real_array("observation", observation, 1)
+        z.setflags(write=False)  # judge, reviser and logger are shown it
         judge, machine = getattr(self.reviser, "risk", self.judge), self.machine
         count = len(self.variables) or getattr(judge, "n_variables", 0)
         count = count or (0 if machine is None else machine.n_variables) or len(self._held)
@@ -1032,7 +1033,7 @@ def answered(reply: Any) -> bool:
 def asked(failed: Callable[[NDArray[np.float64]], bool], z: NDArray[np.float64]) -> bool:
     """Whether a function says that an observation is a failure."""
     try:
-        return answered(failed(z))
+        return answered(failed(z.copy()))
     except Exception as error:
         error.add_note(f"failed was asked of {z}; it is also asked around what was observed")
         raise

@@ -521,14 +521,14 @@ class Terms:
         if self._failed is None or isinstance(self._failed, str):
             return step.terminated and (self._failed is not None or self.guard.failed is None)
         try:
-            return answered(self._failed(step))
+            return answered(self._failed(replace(step, observation=deepcopy(step.observation))))
         except (AttributeError, KeyError, TypeError) as error:
             error.add_note(f"failed gets a step {StepResult.__slots__}, such as failed={_FAILED}")
             raise
 
     def look(self, observation: Any) -> Floats | None:
         """What the guard observes; None where there is nothing to judge."""
-        reply = None if observation is None else self._observe(observation)
+        reply = None if observation is None else self._observe(deepcopy(observation))
         return None if reply is None else np.array(reply, dtype=np.float64)
 
 

@@ -9,16 +9,16 @@ from __future__ import annotations
 import math
 import operator
 import warnings
+from copy import copy
 from enum import Enum
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.sharing import Rollback
-from evofsm.fsm.validation import action_name, check_index, probability
+from evofsm.fsm.validation import Floats, action_name, check_index, probability
 from evofsm.guard.actions import (
     Action,
     ActionSet,
@@ -247,21 +247,25 @@ class ActionReviser:
     ) -> Search:
         """Which option should be executed: the judge's own, or the best of those it is given."""
         if self._searches:
-            how = {"tolerance": self.tolerance, "mask": mask}
-            search = self.risk.search(situation, wanted, **how)  # type: ignore[attr-defined]
+            how = {"tolerance": self.tolerance, "mask": copy(mask)}
+            search = self.risk.search(situation, copy(wanted), **how)  # type: ignore[attr-defined]
             return self._checked(search, wanted, mask)
         options = np.minimum(np.maximum(wanted, self._lowest), self._highest)
         if mask is not None:
             options = options[np.append(True, mask)]
         if not acts:
-            options = self.risk.effective(situation, options)
+            options = self._clip(self.risk.effective(situation, options))
         if self.risk.trial() is None:  # most proposals are kept: this one is looked at first
-            judgement = self._judged(self.risk.judge(situation, options[:1]), 1)
+            judgement = self._judged(self.risk.judge(situation, options[:1].copy()), 1)
             if judgement.risk[0] <= self.tolerance * (_RELEASE if self.refuses else 1.0):
                 self.refuses = False
                 return Search(options[:1], judgement, 0, _KEPT)
-        judgement = self._judged(self.risk.judge(situation, options), len(options))
+        judgement = self._judged(self.risk.judge(situation, options.copy()), len(options))
         return Search(options, judgement, *self._decide(situation, options, judgement, acts))
+
+    def _clip(self, options: Floats) -> Floats:
+        """What a judge made of options, put at the edge of the set where it lies outside."""
+        return np.minimum(np.maximum(options, self._low), self._high)
 
     def _judged(self, judgement: Judgement, count: int) -> Judgement:
         """What the judge said, if it is a judgement of so many options."""
@@ -276,7 +280,7 @@ class ActionReviser:
     def _checked(self, search: Search, wanted: Action, mask: Mask | None) -> Search:
         """What a judge found that looks for an action itself, if that may be executed."""
         try:
-            options = np.minimum(np.maximum(search.options, self._low), self._high)
+            options = self._clip(search.options)
             judgement, best = self._judged(search.judged, len(options)), operator.index(search.best)
             is_usable_one = best >= 0 and is_usable(self.actions, options[best], mask)
             if is_usable_one and same_action(options[0], wanted):
@@ -297,7 +301,7 @@ class ActionReviser:
             raise ValueError(f"{text}; it has to be one of {self.actions}")
 
     def _decide(
-        self, situation: Situation, options: NDArray[np.float64], judged: Judgement, acts: bool
+        self, situation: Situation, options: Floats, judged: Judgement, acts: bool
     ) -> tuple[int, str]:
         """Index of the best option, and why."""
         limit = self.tolerance * (_RELEASE if self.refuses else 1.0)
@@ -318,7 +322,7 @@ class ActionReviser:
                 return index, f"{why}; {trial.unknown}, so {trial.how}"
             why = f"{why}; {trial.unknown}, {trial.assumed}"
         # Once revising, what is safe by the margin; else whatever is tolerable.
-        choice = self.risk.choose(situation, options, judged, (limit, self.tolerance))
+        choice = self.risk.choose(situation, options.copy(), judged, (limit, self.tolerance))
         if choice is not None:
             name = f"{type(self.risk).__name__}.choose: option"
             best = check_index(name, choice[0], len(options))
@@ -335,7 +339,7 @@ class ActionReviser:
                 return int(tolerable[change[tolerable].argmin()]), f"{why}; the closest that can"
         return least, f"{why}; nothing can, the least risky"
 
-    def _closest_to(self, action: Action, options: NDArray[np.float64]) -> int:
+    def _closest_to(self, action: Action, options: Floats) -> int:
         self._refuse_unusable("trial", action)
         return int(distances(self.actions, options, action).argmin())
 

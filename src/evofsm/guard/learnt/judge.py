@@ -635,12 +635,13 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         return f"{type(self).__name__}(dt={self.dt:g}, seed={self.seed})"
 
 
-def _answer(name: str, function: Callable[..., ArrayLike], *at: Any) -> Floats:
+def _answer(name: str, function: Callable[..., ArrayLike], z: Floats, *action: Any) -> Floats:
     """What a given function says, as numbers."""
     try:
-        return np.array(function(*at), np.float64)
+        return np.array(function(z.copy(), *action), np.float64)
     except Exception as error:
-        error.add_note(f"{name} was asked of {', '.join(map(str, at))}, near what was observed")
+        place = ", ".join(map(str, (z, *action)))
+        error.add_note(f"{name} was asked of {place}, near what was observed")
         raise
 
 
