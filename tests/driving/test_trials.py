@@ -70,7 +70,10 @@ def test_decisions_are_those_of_the_record():
         assert decision.realised == pytest.approx(did)
 
 
-@pytest.mark.parametrize("line", [RuntimeError("lost"), math.nan, math.inf, Proposal(None)])
+NO_NUMBERS = [math.nan, math.inf, "1.0", [], (1.0,), [1.0, 2.0], b"1", Proposal(None)]
+
+
+@pytest.mark.parametrize("line", [RuntimeError("lost"), *NO_NUMBERS, Proposal(1.0, [True])])
 def test_a_controller_that_fails_once_is_driven_on_without(line, caplog):
     lines, scenario = iter([1.0, 1.0, line]), EMERGENCY.draw(0, 0).scenario
 
