@@ -211,11 +211,15 @@ def checked_mask(actions: ActionSet, mask: ArrayLike | None) -> Mask | None:
     """Which of a few actions are allowed; None where all are, or none, which tells nothing."""
     if mask is None:
         return None
-    flags = np.asarray(mask).astype(np.bool_)
+    entries = np.asarray(mask)
+    flags = entries == 1
     if not isinstance(actions, Choices) or flags.shape != (actions.n_actions,):
         fault = f"has shape {flags.shape}, but the guard has {actions}"
         hint = "it must have an entry for each of Choices"
         raise ValueError(f"the mask of allowed actions {fault}; {hint}")
+    if not (flags | (entries == 0)).all():
+        hint = "each entry must be True or False (a list of indices, or of texts?)"
+        raise ValueError(f"the mask of allowed actions is {mask!r}; {hint}")
     return flags if 0 < flags.sum() < len(flags) else None
 
 

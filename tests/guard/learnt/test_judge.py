@@ -302,6 +302,12 @@ def test_only_what_a_mask_allows_is_executed_and_a_log_replays_it(points, tmp_pa
     assert found.replayed == found.contents.decisions == len(said)
 
 
+@pytest.mark.parametrize("mask", [["1", "0", "0"], [0, 1, 2], [math.nan, 1.0, 0.0]])
+def test_a_mask_of_texts_or_indices_is_refused(points, mask):
+    with pytest.raises(ValueError, match=r"mask of allowed actions is .* must be True or False"):
+        points["choices"].guard().decide([0.0, 0.0], Proposal(1, mask))
+
+
 @pytest.mark.parametrize("mask", [[True, False], [[True] * 3], True])
 def test_a_mask_of_other_actions_is_refused(points, mask):
     for name in ("choices", "box"):
