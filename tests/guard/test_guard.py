@@ -7,6 +7,7 @@ from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from functools import partial
+from io import BytesIO
 from types import SimpleNamespace
 
 import numpy as np
@@ -326,6 +327,10 @@ def test_what_a_file_cannot_hold_has_to_be_given_again(tmp_path):
     for part in (SimpleNamespace(actions=Choices(2)), ActionReviser(Balance(index=True), own)):
         with pytest.raises(ValueError, match=r"no file can hold .* of (Choices|Own)"):
             Guard.of(part, interval=DT).save(path)
+    for name, does in (("save", "wrote nothing"), ("load", "gave None")):
+        forgetful = type("Half", (Balance,), {name: lambda *_: None})()
+        with pytest.raises(ValueError, match=f"^Half.{name} {does}: what it learnt"):
+            continuous(judge=forgetful).save(BytesIO())
     with pytest.raises(ValueError, match="holds a guard, not a machine"):
         EvolvingFSM.load(path)
 

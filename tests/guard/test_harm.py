@@ -158,6 +158,13 @@ class Cautious(ObservingJudge):
     def end(self, observation, *, failed, terminated):
         self.ends.append((failed, terminated))
 
+    def save(self, path, provenance=None):
+        path.write(b"all but harm")
+
+    @classmethod
+    def load(cls, path):
+        return cls()
+
 
 def test_a_judge_of_ones_own_sees_all_and_is_found_to_do_harm(tmp_path):
     judge = Cautious()

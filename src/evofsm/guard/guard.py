@@ -1061,9 +1061,14 @@ def _bytes(saved: EvolvingFSM | LearningJudge | None) -> NDArray[np.uint8]:
     file = BytesIO()
     if saved is not None:
         saved.save(file)
+        name = type(saved).__name__
+        if not file.getvalue():
+            raise ValueError(f"{name}.save wrote nothing: what it learnt would be lost")
         again: Any = type(saved).load(BytesIO(file.getvalue()))
+        if again is None:
+            raise ValueError(f"{name}.load gave None: what it learnt would be lost")
         if isinstance(saved, ObservingJudge):
             rows, harm = (j and (*j.harm[1:], j.harm.rows.tolist()) for j in (again, saved))
             if rows != harm:  # by which a loaded guard knows whether to act
-                raise ValueError(f"{type(saved).__name__}.save does not keep harm, or load it")
+                raise ValueError(f"{name}.save does not keep harm, or load it")
     return np.frombuffer(file.getvalue(), np.uint8)
