@@ -8,7 +8,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from functools import partial
 from io import BytesIO
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -324,7 +323,10 @@ def test_what_a_file_cannot_hold_has_to_be_given_again(tmp_path):
         Guard.load(path, failed=lambda z: False)
     assert Guard.load(path, judge=Balance, failed=lambda z: z[0] > 1.0).failed is not None
     own = type("Own", (Choices,), {})(5)
-    for part in (SimpleNamespace(actions=Choices(2)), ActionReviser(Balance(index=True), own)):
+    for part in (
+        type("Own", (Unrevised,), {})(Choices(2)),
+        ActionReviser(Balance(index=True), own),
+    ):
         with pytest.raises(ValueError, match=r"no file can hold .* of (Choices|Own)"):
             Guard.of(part, interval=DT).save(path)
     for name, does in (("save", "wrote nothing"), ("load", "gave None")):
@@ -365,6 +367,17 @@ def test_of_a_vector_what_need_not_change_does_not_and_nobody_can_change_what_wa
     ):
         with pytest.raises(ValueError, match="read-only"):
             one[0] = 0.0
+
+
+def test_who_revises_without_a_revision_is_named_and_ranges_may_be_lists():
+    own = type("Own", (Unrevised,), {"revise": lambda *_: 0.5})(IntervalActions(-2.5, 2.5, 0.3))
+    with pytest.raises(TypeError, match=r"^Own.revise gave 0\.5; it has to give a Revision"):
+        Guard.of(own, interval=DT).decide([0.0, 0.0], 1.0)
+    listed = type("Own", (Balance,), {"ranges": [[-1.0, 1.0]], "why": lambda *_: None})()
+    with pytest.raises(ValueError, match="angle is 2; it must lie between -1 and 1"):
+        continuous(judge=listed).decide([2.0, 0.0], 1.0)
+    reason = continuous(judge=listed).decide([0.5, 0.5], 4.0).reason
+    assert "risk is above the tolerance; " in reason
 
 
 # -- A judge's own search -----------------------------------------------------------------------
@@ -414,8 +427,15 @@ def test_a_search_keeps_to_what_is_allowed():
         *(({"low": -1.0, "high": 1.0, "interval": dt}, "interval") for dt in (0.0, -1.0, math.nan)),
         ({"low": -1.0, "high": 1.0, "failed": True}, r"failed is .*; it must be a function"),
         ({"low": -1.0, "high": 1.0, "mode": "on"}, "mode is 'on'; it is one of off, shadow, act"),
+        (
+            {"low": -1.0, "high": 1.0, "judge": type("No", (Balance,), {"fallback": None})()},
+            r"judge is .*No object.* has no fallback \(is it a subclass of evofsm.guard.ActionJ",
+        ),
         ({"low": -1.0, "high": 1.0, "judge": Balance}, "must be an object with a method judge"),
-        ({"low": -1.0, "high": 1.0, "audit": "log.jsonl"}, "has no method decided"),
+        (
+            {"low": -1.0, "high": 1.0, "audit": "log.jsonl"},
+            r"audit is .* has no begin, seen, decided, ended \(is it",
+        ),
         ({"low": -1.0, "high": 1.0, "judge": None, "names": "ab"}, "names is 'ab'; it must be"),
         ({"low": -1.0, "high": 1.0, "names": np.array(["a", "b"])}, "no names: leave them out"),
         ({"low": [0.0, 0.0], "high": [1.0], "judge": None}, "low has 2 components and high has 1"),

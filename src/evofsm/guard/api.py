@@ -308,3 +308,19 @@ class RiskMeasure(Protocol):
         Rows are gap [m], speed of the follower and of the leader [m/s], ``dt`` [s] apart. Danger is
         in the measure's own unit; above 0 it calls for braking.
         """
+
+
+# Of each kind of part its protocol, and what is asked of it; a subclass of a judge has the last.
+_ASKED = {
+    "judge": ("ActionJudge", "judge why labels fallback trial effective choose refuse_unfit"),
+    "reviser": ("Reviser", "actions revise start_episode"),
+    "audit": ("DecisionLogger", "begin seen decided ended"),
+}
+
+
+def refuse_lacking(kind: str, part: object) -> None:
+    """Raise a TypeError where a judge, a reviser or an audit lacks what it is asked for."""
+    protocol, names = _ASKED[kind]
+    if lacks := [name for name in names.split() if getattr(part, name, None) is None]:
+        hint = f"no {', '.join(lacks)} (is it a subclass of evofsm.guard.{protocol}?)"
+        raise TypeError(f"{kind} is {part!r}, which has {hint}")

@@ -52,6 +52,7 @@ from evofsm.guard.api import (
     Revision,
     Situation,
     is_missing,
+    refuse_lacking,
 )
 from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.parts import outline, rebuild, settings_of
@@ -325,8 +326,9 @@ class Guard:
         n_episodes: int = 0,
         n_failed: int = 0,
     ) -> None:
-        if not (audit is None or hasattr(audit, "decided")):
-            raise TypeError(f"audit is {audit!r}, which has no method decided")
+        refuse_lacking("reviser", reviser)
+        if audit is not None:
+            refuse_lacking("audit", audit)
         share(self)
         #: In which it was made; None of what was copied as Python does, which learns for itself.
         self.process: int | None = os.getpid()
@@ -699,7 +701,7 @@ class Guard:
         """
         revision = self.reviser.revise(situation, proposal)
         if not isinstance(self.reviser, ActionReviser):  # which executes nothing else if it acts
-            self._refuse_unfit(revision.executed)
+            self._refuse_unfit(revision)
         if self.explaining or self.audit is not None:
             revision = self._explained(situation, revision)
         if self.audit is not None:
@@ -710,13 +712,17 @@ class Guard:
             revision = revision._replace(executed=choice, advised=advice)
         return revision
 
-    def _refuse_unfit(self, action: Any) -> None:
+    def _refuse_unfit(self, revision: Any) -> None:
         """Raise for what somebody's own reviser would execute, if that is no action of the set."""
-        with suppress(TypeError, ValueError):
-            if not make_usable(Proposal(action), self.actions).remark:
-                return
         name = type(self.reviser).__name__
-        raise ValueError(f"{name} would execute {action!r}, which is none of {self.actions}")
+        if not isinstance(revision, Revision):
+            raise TypeError(f"{name}.revise gave {revision!r}; it has to give a Revision")
+        with suppress(TypeError, ValueError):
+            if not make_usable(Proposal(revision.executed), self.actions).remark:
+                return
+        raise ValueError(
+            f"{name} would execute {revision.executed!r}, which is none of {self.actions}"
+        )
 
     def _take_in(self, situation: Situation, executed: Action) -> None:
         """Machine and judge learn what was executed; what follows on none of the set is not theirs.
@@ -1015,7 +1021,11 @@ def _warm_machine() -> None:
 
 def ends_of(judge: ActionJudge | None, m: int) -> NDArray[np.float64]:
     """(2, m) ndarray: least and most that each of m variables can be."""
-    return _resized(getattr(judge, "ranges", ((-_LARGEST_VALUE, _LARGEST_VALUE),)), m)
+    ranges = getattr(judge, "ranges", ((-_LARGEST_VALUE, _LARGEST_VALUE),))
+    try:
+        return _resized(ranges, m)
+    except TypeError:  # lists, of which none is remembered
+        return _resized.__wrapped__(ranges, m)
 
 
 @cache

@@ -45,6 +45,7 @@ from evofsm.guard.api import (
     Search,
     SearchingJudge,
     Situation,
+    refuse_lacking,
 )
 
 # Further decisions for which an action is held whose effect is not known yet.
@@ -176,6 +177,7 @@ class ActionReviser:
         tolerance: float = TOLERANCE,
         mode: Mode = Mode.ACT,
     ) -> None:
+        refuse_lacking("judge", risk)
         risk.refuse_unfit(actions)
         self.risk = risk
         self.fallback = risk.fallback  #: what is done without a usable proposal
@@ -314,7 +316,7 @@ class ActionReviser:
             is_known = judged.risk[0] <= limit
             return 0, _KEPT if is_known else "its risk is not known yet"
         self.refuses = True
-        why = self.risk.why(judged)
+        why = self.risk.why(judged) or "risk is above the tolerance"
         if trial is not None:
             if acts:
                 self._trial = _TRIAL
