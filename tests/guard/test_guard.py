@@ -299,6 +299,14 @@ def test_a_copy_goes_its_own_way(make, snapshot):
 # -- What is kept -------------------------------------------------------------------------------
 
 
+def test_a_judge_that_cannot_be_copied_is_told_what_it_lacks():
+    judge = Balance()
+    judge.lock = threading.Lock()
+    with pytest.raises(TypeError) as told:
+        continuous(judge=judge).copy()
+    assert "the judge or reviser cannot be copied" in told.value.__notes__[0]
+
+
 def test_what_was_saved_goes_on_bit_for_bit(make, snapshot, tmp_path):
     guard, path = make(tolerance=0.05, mode=Mode.SHADOW), tmp_path / "guard"
     balance(guard, pushes(make, 20))

@@ -144,11 +144,12 @@ class Trial(NamedTuple):
 class ActionJudge(Protocol):
     """Anything that can be asked how dangerous an action is, whatever system it knows.
 
-    Actions come as a (k,) array, of `BoxActions` as a (k, d) one, its own to change; an observation
-    is read only. One that knows what the variables
-    of an observation can be may say so as ``ranges``, (least, most) of each, of more in turn: a
-    guard refuses all else. With ``lowest_first`` true the lowest of several actions that are least
-    risky is taken, as cars brake; else the one closest to the proposal.
+    Actions come as a (k,) array, of `BoxActions` as a (k, d) one; it changes none of what it is
+    given, and an observation is read only. Where environments share a guard, each has a copy of it
+    (`copy.deepcopy`). One that knows what the variables of an observation can be may say so as
+    ``ranges``, (least, most) of each, of more in turn: a guard refuses all else. With
+    ``lowest_first`` true the lowest of several actions that are least risky is taken, as cars
+    brake; else the one closest to the proposal.
     """
 
     #: What it calls the variables of an observation.
@@ -310,8 +311,8 @@ class RiskMeasure(Protocol):
         """
 
 
-# Of each kind of part its protocol, and what is asked of it; a subclass of a judge has the last.
-_ASKED = {
+# Of each kind of part its protocol, and what is asked of it.
+_PARTS_HAVE = {
     "judge": ("ActionJudge", "judge why labels fallback trial effective choose refuse_unfit"),
     "reviser": ("Reviser", "actions revise start_episode"),
     "audit": ("DecisionLogger", "begin seen decided ended"),
@@ -320,7 +321,7 @@ _ASKED = {
 
 def refuse_lacking(kind: str, part: object) -> None:
     """Raise a TypeError where a judge, a reviser or an audit lacks what it is asked for."""
-    protocol, names = _ASKED[kind]
+    protocol, names = _PARTS_HAVE[kind]
     if lacks := [name for name in names.split() if getattr(part, name, None) is None]:
         hint = f"no {', '.join(lacks)} (is it a subclass of evofsm.guard.{protocol}?)"
         raise TypeError(f"{kind} is {part!r}, which has {hint}")

@@ -902,7 +902,12 @@ class Guard:
         """
         machine = None if self.machine is None else self.machine.copy()
         memo = {id(self.machine): machine}  # for a judge that asks the machine
-        reviser, judge = copy.deepcopy((self.reviser, self.judge), memo)
+        try:
+            reviser, judge = copy.deepcopy((self.reviser, self.judge), memo)
+        except Exception as error:
+            text = "the judge or reviser cannot be copied, as for each of several environments"
+            error.add_note(f"{text} that share a guard: give it __deepcopy__")
+            raise
         settings = {name: getattr(self, name) for name in (*_PLAIN_SETTINGS, "failed")}
         machine = machine if states else None
         twin = type(self).of(reviser, judge=judge, machine=machine, **settings)
