@@ -644,16 +644,17 @@ def test_an_episode_begins_as_its_columns_say_though_its_first_rows_lack_a_numbe
 STOPS = ["0 1 1 on", "1 2 9 on", "2 3 9 on", "3 4 0 on", "4 5 0 off", "5 6 9 on", "6 7 9 off"]
 
 
+@pytest.mark.parametrize("value", ["4", "", "Bad"])
 @pytest.mark.parametrize(
     ("status", "failures"),
     [("on on on off off on on", [[1], []]), ("on on on on off on off", [[], [1]])],
 )
 def test_rows_that_are_not_chosen_end_an_episode_in_failure_if_it_begins_with_them(
-    tmp_path, pieces, status, failures
+    tmp_path, pieces, status, failures, value
 ):
     rows = [f"{row[:5]} {one}" for row, one in zip(STOPS, status.split(), strict=True)]
-    noted = Noted()
-    found = taken(tmp_path, rows, noted, where="u>5", failed="Status==off")
+    rows[3:5] = (row.replace(row[2], value, 1) for row in rows[3:5])  # they need not be right
+    found = taken(tmp_path, rows, noted := Noted(), where="u>5", failed="Status==off", skip_bad=0)
     assert [values for _, values, *_ in found] == [[2, 3], [6, 7]]
     assert [fails for *_, fails in found] == failures
     assert (noted.elsewhere, noted.unplaced) == (3, sum(not fails for fails in failures[:1]))

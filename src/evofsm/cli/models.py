@@ -42,7 +42,7 @@ def failure(text: str | None, names: Sequence[str]) -> Callable[[Any], bool] | N
     condition = Condition.parse(text or names[0])
 
     def failed(z: Any) -> bool:
-        return condition.holds_of(dict(zip(names, z, strict=True)))
+        return bool(condition.holds_of(dict(zip(names, z, strict=True))))
 
     return failed if text and {term.column for term in condition.terms} <= {*names} else None
 

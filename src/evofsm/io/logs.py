@@ -222,14 +222,14 @@ class Term(NamedTuple):
         """Whether the column is compared with a number."""
         return isinstance(self.value, float)
 
-    def holds(self, piece: Piece) -> Bools:
-        """In which rows of a piece it holds; where nothing stands it never does."""
+    def holds(self, piece: Piece, truth: bool = True) -> Bools:
+        """In which rows of a piece it holds, or does not; where nothing stands it never does."""
         if self.of_number:
             values = piece.numbers[self.column]
-            return np.asarray(_SIGNS[self.sign](values, self.value) & ~np.isnan(values))
+            return np.asarray((_SIGNS[self.sign](values, self.value) == truth) & ~np.isnan(values))
         texts = piece.texts[self.column].str.strip_chars()
         kinds = texts.unique().to_list()
-        return texts.is_in([kind for kind in kinds if self.truth_of(kind)]).to_numpy()
+        return texts.is_in([kind for kind in kinds if self.truth_of(kind) is truth]).to_numpy()
 
     def leave_out(self, piece: Piece) -> None:
         """Leave out rows of a piece in which there is no truth value, if it asks for one."""
@@ -298,14 +298,18 @@ class Condition(NamedTuple):
         """All of them."""
         return [term for terms in self.either for term in terms]
 
-    def holds(self, piece: Piece) -> Bools:
-        """In which rows of a piece it holds."""
-        parts = [np.logical_and.reduce([t.holds(piece) for t in terms]) for terms in self.either]
-        return np.asarray(np.logical_or.reduce([np.zeros(piece.rows, np.bool_), *parts]))
+    def holds(self, piece: Piece, truth: bool = True) -> Bools:
+        """In which rows of a piece it holds, or surely does not."""
+        inner, outer = (np.logical_and, np.logical_or)[:: 1 if truth else -1]
+        parts = [inner.reduce([t.holds(piece, truth) for t in terms]) for terms in self.either]
+        start = np.full(piece.rows, bool(parts) and not truth)
+        return np.asarray(outer.reduce([start, *parts]))
 
-    def holds_of(self, row: Mapping[str, Any]) -> bool:
-        """Whether it holds of one row, of values by column."""
-        return any(all(t.truth_of(row.get(t.column)) for t in terms) for terms in self.either)
+    def holds_of(self, row: Mapping[str, Any]) -> bool | None:
+        """Whether it holds of one row, of values by column; None where that cannot be told."""
+        truths = [[t.truth_of(row.get(t.column)) for t in terms] for terms in self.either]
+        is_false = all(False in terms for terms in truths)
+        return any(map(all, truths)) or (False if is_false else None)
 
 
 class Resample(NamedTuple):
@@ -921,8 +925,17 @@ class _Reader:
         self._noted.units |= units
         self._noted.untold += [name for name in numbers if name not in units]
         texts = [*self._episode, *categories, *(t.column for t in self._terms if not t.of_number)]
-        request = Wanted(numbers, texts, clock if is_dated else (), form)
-        return request, {n: tables.UNITS[u] for n, u in units.items() if u in tables.UNITS}
+        factors = {n: tables.UNITS[u] for n, u in units.items() if u in tables.UNITS}
+        spares = partial(self._spared, factors)
+        return Wanted(numbers, texts, clock if is_dated else (), form, spares), factors
+
+    def _spared(self, factors: Mapping[str, float], piece: Piece) -> Bools:
+        """Rows that --where or --no-leader surely leaves out, whatever else stands in them."""
+        names = {term.column for term in self._terms if term.of_number}
+        si = {name: piece.numbers[name] * factors.get(name, 1.0) for name in names}
+        piece = replace(piece, numbers=si)
+        nobody, where = (self._conditions.get(o, Condition()) for o in ("--no-leader", "--where"))
+        return nobody.holds(piece) | where.holds(piece, truth=False)
 
     def _refuse_unit(self, name: str, unit: str) -> None:
         """Raise where it is none of the column, or not that of the files before, as both tell."""

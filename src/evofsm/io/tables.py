@@ -359,9 +359,10 @@ class Piece:
     headers: Sequence[int] = ()  #: and those before which the columns are named again
     cut: str = ""  #: column in which the last row's field may go on, as nothing ends it
     bad: NDArray[np.bool_] = field(init=False)  #: (T,) rows to leave out
+    spared: NDArray[np.bool_] = field(init=False)  #: (T,) rows that need not be right
 
     def __post_init__(self) -> None:
-        self.bad = np.zeros(self.rows, np.bool_)
+        self.bad, self.spared = np.zeros((2, self.rows), np.bool_)
 
     def at(self, row: int) -> str:
         """Where a row stands, for a message."""
@@ -375,7 +376,7 @@ class Piece:
 
     def leave_out(self, name: str, where: NDArray[np.bool_], why: str = "", hint: str = "") -> None:
         """Leave out rows for what stands in a column."""
-        for row in np.flatnonzero(where & ~self.bad).tolist():
+        for row in np.flatnonzero(where & ~self.bad & ~self.spared).tolist():
             self.skips.leave_out("field", partial(self.told, row, name, why, hint))
             self.bad[row] = True
 
@@ -397,7 +398,7 @@ class Piece:
             anew=np.searchsorted(rows, self.anew).tolist(),
             cut=self.cut if rows[-1:].tolist() == [self.rows - 1] else "",
         )
-        piece.bad[:] = self.bad[rows]
+        piece.bad, piece.spared = self.bad[rows], self.spared[rows]
         return piece
 
 
@@ -416,6 +417,8 @@ class Wanted(NamedTuple):
     texts: Sequence[str] = ()
     dates: Sequence[str] = ()  #: which together come as a number, of microseconds
     form: str = ""  #: how dates are written, as `strftime` has it; else as they look
+    #: Which rows of a piece do not count.
+    spares: Callable[[Piece], NDArray[np.bool_]] | None = None
 
     @property
     def all(self) -> list[str]:
@@ -426,7 +429,7 @@ class Wanted(NamedTuple):
         """The columns of some rows as what is wanted of them; numbers may be given as texts."""
         import polars
 
-        piece = Piece(len(frame), {}, find, skips)
+        piece, odd = Piece(len(frame), {}, find, skips), dict[str, NDArray[np.bool_]]()
         for name in self.numbers:
             values = frame[name]
             if values.dtype == polars.String:
@@ -434,11 +437,15 @@ class Wanted(NamedTuple):
                 values = fields.cast(polars.Float64, strict=False)
                 wrong = values.is_null() & ~fields.fill_null("").str.to_lowercase().is_in(MISSING)
                 if wrong.any():
-                    piece.leave_out(name, wrong.to_numpy())
+                    odd[name] = wrong.to_numpy()
             piece.numbers[name] = values.cast(polars.Float64).to_numpy()
         for name in self.texts:
             texts = frame[name].cast(polars.String)
             piece.texts[name] = texts.fill_null("") if texts.null_count() else texts
+        if self.spares:
+            piece.spared = self.spares(piece)
+        for name, rows in odd.items():
+            piece.leave_out(name, rows)
         if self.dates:
             dates = frame[self.dates[0]]
             for name in self.dates[1:]:  # the time of day, behind the date

@@ -60,7 +60,7 @@ class Slots:
             return None
         values = self._values(row)
         is_told = any(values.get(term.column) is not None for term in condition.terms)
-        return condition.holds_of(values) if is_told else None
+        return bool(condition.holds_of(values)) if is_told else None
 
     def fails(self, row: Message | None) -> bool:
         """Whether a row meets what tells of failures."""
