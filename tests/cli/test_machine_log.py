@@ -306,7 +306,7 @@ def test_an_alarm_that_came_long_before_counts_once_in_each_horizon(evofsm):
 
 def test_live_rows_stand_as_in_the_log_and_what_cannot_be_compared_is_refused(evofsm):
     begun = "--observe", "heat", "--action", "", "--interval", 60, "--time", "Zeit"
-    begun = *begun, "--failed", "trip==1", "--where", "runs"
+    begun = *begun, "--failed", "trip==1 or heat==Low", "--where", "runs"
 
     def answers(*rows):
         lines = [row if isinstance(row, str) else json.dumps(row) for row in rows]
@@ -319,14 +319,15 @@ def test_live_rows_stand_as_in_the_log_and_what_cannot_be_compared_is_refused(ev
     trips = [f"2025-03-10 06:{k:02}:00" for k in range(3, 9)]
     came = answers(
         *({"Zeit": date, **usual} for date in dates),
-        *({"Zeit": date, **usual, "trip": 1} for date in trips),
-        {"Zeit": "2025-03-10 06:09:00", **usual, "runs": 0},
+        {"Zeit": trips[0], **usual, "heat": "Low"},
+        *({"Zeit": date, **usual, "heat": "Bad", "trip": 1} for date in trips[1:]),
+        {"Zeit": "2025-03-10 06:09:00", **usual, "heat": "Bad", "runs": 0},
     )
     assert [one["time"] - came[0]["time"] for one in came] == [60.0 * k for k in range(10)]
     kinds = ["decision"] * 3 + ["end"] + ["waiting"] * 6  # one end of each failure
     assert [one["kind"] for one in came] == kinds
     assert came[3]["failed"]
-    trips = ";1;6,0;yes", *[";1;6,0;yes"] * 5, ";0;6,0;0"
+    trips = ";0;Low;yes", *[";1;Bad;yes"] * 5, ";0;Bad;0"
     times = [f"2025-03-10 06:{k:02}:00" for k in range(3, 10)]
     lines = *(f"{date};0; 6,0;yes" for date in dates), *map("".join, zip(times, trips, strict=True))
     odd = "10.03.2025 06:10:00;0;Bad;1", "10.03.2025 06:10:00;0", "10.03.2025 06:11:00;0;NaN;yes"

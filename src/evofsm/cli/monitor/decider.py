@@ -64,7 +64,7 @@ class Decider:
         self.guard = guard
         self.episode = episode
         self.slots = slots or Slots()
-        self.form = Form(guard, self.slots.keys, *self.slots.clock)
+        self.form = Form(guard, self.slots.keys, *self.slots.clock, self.slots.spares)
         self.keep: Callable[[Taken | None], None] = lambda taken: None
         self.n = 0  #: decisions so far
         self.rows = 0  #: decisions of the episode under way; 0 where none is

@@ -6,14 +6,14 @@ import json
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from operator import itemgetter
 from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
 import msgspec
 import numpy as np
-from msgspec import UNSET, Meta, UnsetType
+from msgspec import UNSET, Meta, UnsetType, structs
 
 from evofsm.driving import Object, Scene, TrafficRisk
 from evofsm.driving.naming import REVERSE, SPEEDS, VARIABLES
@@ -21,7 +21,7 @@ from evofsm.driving.traffic import PLACES, RATES, SIZES
 from evofsm.fsm.naming import visible
 from evofsm.guard import ActionReviser, BoxActions, Choices, Guard
 from evofsm.io.logs import ZONE
-from evofsm.io.tables import TIMES, is_number, seconds_of_date
+from evofsm.io.tables import TIMES, explained, is_number, seconds_of_date
 from evofsm.store import LARGEST_OBSERVATION
 
 SCHEMA = 1  #: the version of the messages
@@ -106,12 +106,18 @@ class Form:
     """Reads lines, for one guard; ``others`` are keys that rows may have beside its variables.
 
     The time may stand in the column of a log, ``clock``, in this unit, or in dates of this form.
+    In a row that is spared, variables may be texts.
     """
 
     def __init__(
-        self, guard: Guard, others: Sequence[str] = (), clock: str = "time", unit: str = "s"
+        self,
+        guard: Guard,
+        others: Sequence[str] = (),
+        clock: str = "time",
+        unit: str = "s",
+        spares: Callable[[Row], bool] = lambda row: False,
     ) -> None:
-        self._guard, reviser = guard, guard.reviser
+        self._guard, self._spares, reviser = guard, spares, guard.reviser
         #: Names of what is observed; empty where they have none, and come as a list.
         self.variables: tuple[str, ...] = guard.variables
         #: Whether the guard observes whole scenes.
@@ -169,6 +175,15 @@ class Form:
         try:
             fields = msgspec.convert({keys[name]: body[name] for name in body}, kind)
         except msgspec.ValidationError as error:
+            texts = {name: body[name] for name in self.variables if isinstance(body.get(name), str)}
+            if texts and kind is self._row:
+                row = self._message({**body, **dict.fromkeys(texts)}, in_si=in_si)
+                assert isinstance(row, Row)
+                if self._spares(row := structs.replace(row, told=row.told | texts)):
+                    return row
+                if in_si:
+                    name, text = texts.popitem()
+                    raise MessageError(name, explained(text)) from None
             raise _refused(body, str(error)) from None
         time, hours = self._when(fields, in_si=in_si)
         if kind is self._end:

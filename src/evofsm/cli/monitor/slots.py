@@ -41,9 +41,11 @@ class Slots:
 
     def refuse(self, row: Row) -> None:
         """Raise where a row cannot be compared with a condition, or be one with others."""
-        for option, term in self._terms:
-            if fault := term.fault(row.told.get(term.column)):
-                raise MessageError(term.column, f"{fault} ({option})", row.clock)
+        for option, term in () if self.spares(row) else self._terms:
+            value = row.told.get(term.column)
+            faults = [t.fault(value) for _, t in self._terms if t.column == term.column]
+            if all(faults):
+                raise MessageError(term.column, f"{faults[0]} ({option})", row.clock)
         if self.step and (row.ahead or not row.observation):
             raise MessageError("objects", "are not resampled; send rows of the variables", row.time)
 
@@ -65,6 +67,11 @@ class Slots:
     def fails(self, row: Message | None) -> bool:
         """Whether a row meets what tells of failures."""
         return bool(self.holds("--failed", row)) and not self.holds("--no-leader", row)
+
+    def spares(self, row: Row) -> bool:
+        """Whether it surely fails or does not count, whatever else stands in it."""
+        values = self._values(row)
+        return any(c.holds_of(values) is (o != "--where") for o, c in self._conditions.items())
 
     def _values(self, row: Message | None) -> dict[str, Any]:
         if not isinstance(row, Row):
@@ -230,11 +237,13 @@ class CsvRows:
             elif name in self._called:
                 yield self._called[name], field or None
 
-    def _number(self, name: str, text: str, dialect: Dialect) -> float | None:
-        """What stands in a field, in units of the SI; None where nothing does."""
+    def _number(self, name: str, text: str, dialect: Dialect) -> float | str | None:
+        """What stands in a field, numbers in units of the SI; None where nothing does."""
         if text.lower().removeprefix("-") in tables.MISSING:
             return None
         if not is_number(plain := text.replace(",", ".") if dialect.has_commas else text):
+            if self._called[name] not in ("time", "proposal"):
+                return text
             raise MessageError(name, explained(text))
         number = float(plain) * self._factors[name]
         return int(number) if self._called[name] == "proposal" and number.is_integer() else number
