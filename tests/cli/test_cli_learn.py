@@ -171,11 +171,12 @@ def test_learn_writes_a_guard_that_the_monitor_takes(evofsm, own, tmp_path, judg
     for words in ("It judges: fails where dist [m] is below", "% of the log's"):
         assert (words in told.stdout) == (judge == "learnt")
     seen = dict(zip(keys, (3.0, 20.0, 15.8), strict=True))
-    odd = {keys[0]: "near"}, {}, {"time": 0.1, keys[1]: 72.0}
+    odd = {keys[0]: "near"}, {}, {"time": 0.1, keys[1]: 72.0}, {"time": 0.2, keys[0]: 9999}
     sent = [{"time": 0.0, "proposal": 1.0, **seen, **one} for one in odd]
     rows.write_text("".join(json.dumps(one) + "\n" for one in sent))
     answers = evofsm("monitor", rows, "--guard", path).stdout.splitlines()
-    wrong, answer, fast = map(json.loads, answers)
+    wrong, answer, fast, far = map(json.loads, answers)
+    assert far["note"].startswith(f"{keys[0]} is 9999, far from all others: a missing value?")
     assert fast["note"] == f"{keys[1]} is above 60 m/s: is that km/h?"
     assert (wrong["about"], wrong["error"]) == (keys[0], 'is "near"; it must be float or null')
     summed = evofsm("monitor", own, *OWN[2:], *options[:2], "--guard", path, "--summary")

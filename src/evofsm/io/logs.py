@@ -41,8 +41,8 @@ SKIPPED = 10  #: bad rows of a file that are left out where nobody said how many
 _FEWEST_VALUES = 5
 OLDEST = 0.5  #: so old may a value be that is held, as `Topics` has it [s]
 _SAME_STEP = 0.05  # share by which the usual steps of two files may differ
-# Numbers that stand for none, where they are so many times as far out as all others of a column.
-_STAND_INS = [999, 9999, 99999, 999999, 32767, 32768, 65535, 2**31 - 1, 2**31, 2**32 - 1]
+#: Numbers that stand for none, where they are so many times as far out as others of a column.
+STAND_INS = [999, 9999, 99999, 999999, 32767, 32768, 65535, 2**31 - 1, 2**31, 2**32 - 1]
 _FAR_OUT = 3.0
 # Speeds [m/s] and usual steps [s] beyond these are most likely in another unit.
 _FASTEST, _LONGEST_USUAL = 60.0, 5.0
@@ -515,7 +515,7 @@ def are_stand_ins(values: Floats) -> Bools:
     [False, False, True, True, False]
     """
     size = np.abs(values)
-    are_likely = np.isin(size, _STAND_INS)
+    are_likely = np.isin(size, STAND_INS)
     usual = size[~are_likely & np.isfinite(size)]
     return np.asarray(are_likely & (size > _FAR_OUT * usual.max(initial=0.0)) & bool(usual.any()))
 

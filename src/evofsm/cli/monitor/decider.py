@@ -34,7 +34,7 @@ from evofsm.guard.api import Proposal, Revision
 from evofsm.guard.audit_log import AuditLog
 from evofsm.guard.foresight import DATES, span
 from evofsm.guard.reviser import is_spoken, make_usable, passed
-from evofsm.io.logs import hours_unsaid
+from evofsm.io.logs import STAND_INS, are_stand_ins, hours_unsaid
 from evofsm.io.tables import IN_UTC, date
 
 _log = logging.getLogger(__name__)
@@ -389,10 +389,19 @@ class Decider:
             yield f"rows come every {span(step)}, but {text}"
         if row.hours is None and row.time >= DATES and self._is_first(IN_UTC):
             yield IN_UTC
-        variables = zip(self.form.variables, self._units, row.observation or (), strict=False)
+        machine, observation = self.guard.machine, row.observation or ()
+        variables = zip(self.form.variables, self._units, observation, strict=False)
         fast = [name for name, unit, z in variables if unit == "m/s" and abs(z or 0.0) > _FAST]
         if fast and self._is_first("fast"):
             yield f"{fast[0]} is above {_FAST:g} m/s: is that km/h?"
+        if machine is None or not machine.n_states:
+            return
+        for k, (name, z) in enumerate(zip(self.form.variables, observation, strict=False)):
+            if z is None or abs(z) not in STAND_INS:
+                continue
+            if are_stand_ins(np.append(machine.centers[:, k], z))[-1]:
+                hint = "a missing value? That is null, in CSV an empty field"
+                yield f"{name} is {z:g}, far from all others: {hint}"
 
     def _is_first(self, remark: str) -> bool:
         """Whether it was not said yet; from now on it was."""
