@@ -198,6 +198,17 @@ def test_episodes_that_come_back_are_refused_with_the_remedy(tmp_path, pieces):
     assert "sort the file by run, pair, segment and then by time" in message
 
 
+def test_between_batches_nothing_may_stand_or_what_is_left_out(tmp_path, pieces):
+    for idle, where in (("", None), (" ", None), ("idle", "batch!=idle")):
+        names = "aa", idle, idle, "bb", "cc", idle, "dd"
+        lines = [f"{k},{k},1,{name}" for k, name in enumerate(names)]
+        path = write(tmp_path / "a.csv", lines, "time,x,u,batch")
+        columns = {"observe": ObservationEncoder("x"), "action": "u", "episode": ["batch"]}
+        episodes = episodes_of(read(path, where=where, **columns))
+        expected = [[0], [1, 2], [3], [4], [5], [6]] if where is None else [[0], [3], [4], [6]]
+        assert [one.times.tolist() for one in episodes] == expected
+
+
 @pytest.mark.parametrize(
     ("content", "said"),
     [

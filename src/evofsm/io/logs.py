@@ -990,8 +990,10 @@ class _Reader:
         starts[0] = self._latest != tuple(key[0] for key in keys)
         self._latest = tuple(key[-1] for key in keys)
         rows = np.flatnonzero(starts)
-        for row, *episode in zip(rows.tolist(), *(key.gather(rows) for key in keys), strict=True):
-            if tuple(episode) in self._known:
+        texts, counts = (k.gather(rows) for k in keys), np.logical_or.reduceat(~piece.spared, rows)
+        for row, count, *episode in zip(rows.tolist(), counts, *texts, strict=True):
+            # Between batches nothing stands, or what does not count.
+            if count and any(map(str.strip, episode)) and tuple(episode) in self._known:
                 names = ", ".join(self._episode)
                 raise ValueError(
                     f"{piece.at(row)}: the episode {', '.join(text[:40] for text in episode)} "
