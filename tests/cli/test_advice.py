@@ -168,6 +168,18 @@ def test_what_a_first_look_proposes_reads_all_rows(evofsm, names):
     assert "1 episode ended with f==True" in found
 
 
+@pytest.mark.parametrize(
+    ("field", "live"), [(" Fault ", "Fault"), ('"too hot\ntrip"', "too hot\ntrip"), ("TRUE", True)]
+)
+def test_rows_meet_a_failure_that_is_proposed_in_the_log_and_live(evofsm, field, live):
+    rows = (f"{k}, {k % 7},{field if k == 300 else ' FALSE'}" for k in range(600))
+    Path("log.csv").write_text("\n".join(["time,level,f", *rows]))
+    command = evofsm("learn", "log.csv").stdout.replace("\\\n", "").rpartition("  evofsm ")[2]
+    assert "1 episode ended with f==" in said(evofsm(*shlex.split(command)))
+    Path("row.json").write_text(json.dumps({"time": 0, "level": 3, "f": live}))
+    assert json.loads(evofsm("monitor", "row.json", "--guard", "guard.evofsm").stdout)["failed"]
+
+
 def test_a_row_of_each_signal_becomes_a_column_as_it_is_advised(evofsm):
     rows = (f"{k // 2},{('level', 'flow')[k % 2]},{k % 7}" for k in range(200))
     Path("tags.csv").write_text("\n".join(["time,tag,value", *rows]))

@@ -680,6 +680,7 @@ def test_rows_that_are_not_chosen_end_an_episode_in_failure_if_it_begins_with_th
         ("x>2.5 and Status==on", [2]),
         ("x>3.5 or u<1", [3]),
         ("Status=='a or b' or x>=7", [6]),
+        ("x==Bad or x>=7", [6]),
         ("Status==nothing", []),
         ("Status=='NA'", [1]),
     ],

@@ -133,7 +133,7 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
     ]
     if columns.failed and not noted.failing:
         goes = []
-        for name, (start, *more) in ((k, v) for k, v in noted.compared.items() if v):
+        for (name, _), (start, *more) in ((k, v) for k, v in noted.compared.items() if v):
             if isinstance(start, str):
                 goes.append(f"{name} is {', '.join(map(repr, [start, *more]))}")
             else:

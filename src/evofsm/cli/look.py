@@ -214,8 +214,9 @@ def _first_rows(
             break
     if not len(frame):
         return frame, clock, form
+    frame = frame.with_columns(polars.col(polars.String).str.strip_chars())
     for name in texts:  # of which the first alone is no number
-        fields = frame[name].str.strip_chars()
+        fields = frame[name]
         fields = fields.set(fields.str.to_lowercase().is_in(tables.MISSING), None)
         floats = fields.str.replace(",", ".", literal=True).cast(polars.Float64, strict=False)
         bad = fields.filter(floats.is_null() & fields.is_not_null())
@@ -280,9 +281,9 @@ def _dates(
     frame: polars.DataFrame, names: Sequence[str], asides: Pairs
 ) -> tuple[polars.DataFrame, str, str] | None:
     """Rows with dates as `_OTHER` has them, in one column or two; None of others."""
-    texts = frame[names[0]].str.strip_chars()
+    texts = frame[names[0]]
     for name in names[1:]:
-        texts = texts + " " + frame[name].str.strip_chars()
+        texts = texts + " " + frame[name]
     if not (match := _OTHER.match(str(texts[0]))) or texts.n_unique() < 2:
         return None
     first, sign, second, third, space, has_seconds, has_parts, half = match.groups("")

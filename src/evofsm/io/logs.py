@@ -66,7 +66,7 @@ _MANY_TEXTS = 10  # so many texts of a column are shown
 BECOME = ("mean", "last", "max", "min")  #: what the values of a step may become
 _HOLE = 10.0  # in steps of what is resampled, the longest hole within an episode
 # A value in quotes; and what stands between conditions, outside of quotes.
-_IN_QUOTES = re.compile(r"""(["'])(.*)\1$""")
+_IN_QUOTES = re.compile(r"""(["'])(.*)\1$""", re.DOTALL)
 _OUTSIDE = r"""(?=(?:[^"']|"[^"]*"|'[^']*')*$)"""
 _OR, _AND = (re.compile(rf"\s+{word}\s+{_OUTSIDE}") for word in ("or", "and"))
 _SIGNS = {"<=": operator.le, ">=": operator.ge, "<": operator.lt, ">": operator.gt}
@@ -124,8 +124,8 @@ class Noted:
     began: float = 0.0  #: time 0, where that is a date, since 1970 [s]
     in_utc: bool = False  #: whether times of day are, wherever the log is from
     failing: int = 0  #: rows that meet what tells of failures
-    #: By column compared for that, what was there: the ends of its range in SI, or texts.
-    compared: dict[str, list[Any]] = field(default_factory=dict)
+    #: By column compared for that, and whether with numbers: ends of its range in SI, or texts.
+    compared: dict[tuple[str, bool], list[Any]] = field(default_factory=dict)
     fastest: dict[str, float] = field(default_factory=dict)  #: by variable, beyond belief [m/s]
     longest_step: float = 0.0  #: the usual one, beyond belief [s]
     #: By variable, the number below 0 or far out (0 where there are several), and in how many rows.
@@ -265,9 +265,12 @@ class Term(NamedTuple):
         value = self._there(value)
         if not self.sign:
             return _TRUTHS.get(str(value).lower())
-        if value is None or isinstance(value, str) == self.of_number:
+        target = self.value
+        if isinstance(value, bool) and isinstance(target, str):  # JSON's true, for a log's TRUE
+            target = _TRUTHS.get(target.lower(), "")
+        if value is None or isinstance(value, str) != isinstance(target, str):
             return None
-        return bool(_SIGNS[self.sign](value, self.value))
+        return bool(_SIGNS[self.sign](value, target))
 
     def _there(self, value: Any) -> Any:
         """What stands in a field, if anything does; what is compared with always does."""
@@ -1092,7 +1095,8 @@ class _Reader:
     def _note_compared(self, piece: Piece) -> None:
         """What stands in the columns that tell of failures, should no row meet what is asked."""
         for term in self._failed.terms:
-            entries: list[Any] = self._noted.compared.setdefault(term.column, [])
+            kind = term.column, term.of_number
+            entries: list[Any] = self._noted.compared.setdefault(kind, [])
             if term.of_number:
                 values = piece.numbers[term.column]
                 values = np.append(entries, values[np.isfinite(values)])
