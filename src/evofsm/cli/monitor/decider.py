@@ -64,7 +64,8 @@ class Decider:
         self.guard = guard
         self.episode = episode
         self.slots = slots or Slots()
-        self.form = Form(guard, self.slots.keys, *self.slots.clock, self.slots.spares)
+        self.form = Form(guard, self.slots.keys, *self.slots.clock)
+        self.form.spares = self.slots.spares
         self.keep: Callable[[Taken | None], None] = lambda taken: None
         self.n = 0  #: decisions so far
         self.rows = 0  #: decisions of the episode under way; 0 where none is
@@ -389,19 +390,16 @@ class Decider:
             yield f"rows come every {span(step)}, but {text}"
         if row.hours is None and row.time >= DATES and self._is_first(IN_UTC):
             yield IN_UTC
-        machine, observation = self.guard.machine, row.observation or ()
-        variables = zip(self.form.variables, self._units, observation, strict=False)
+        variables = zip(self.form.variables, self._units, row.observation or (), strict=False)
         fast = [name for name, unit, z in variables if unit == "m/s" and abs(z or 0.0) > _FAST]
         if fast and self._is_first("fast"):
             yield f"{fast[0]} is above {_FAST:g} m/s: is that km/h?"
-        if machine is None or not machine.n_states:
-            return
-        for k, (name, z) in enumerate(zip(self.form.variables, observation, strict=False)):
-            if z is None or abs(z) not in STAND_INS:
-                continue
-            if are_stand_ins(np.append(machine.centers[:, k], z))[-1]:
-                hint = "a missing value? That is null, in CSV an empty field"
-                yield f"{name} is {z:g}, far from all others: {hint}"
+        pairs = enumerate(zip(self.form.variables, row.observation or (), strict=False))
+        odd = [(k, name, z) for k, (name, z) in pairs if z and abs(z) in STAND_INS]
+        centers = machine.centers if odd and (machine := self.guard.machine) else np.empty((0, 0))
+        for k, name, z in odd:
+            if are_stand_ins(np.append(centers[:, k : k + 1], z))[-1]:
+                yield f"{name} is {z:g}, far from all others: a missing value? That is null"
 
     def _is_first(self, remark: str) -> bool:
         """Whether it was not said yet; from now on it was."""

@@ -106,18 +106,14 @@ class Form:
     """Reads lines, for one guard; ``others`` are keys that rows may have beside its variables.
 
     The time may stand in the column of a log, ``clock``, in this unit, or in dates of this form.
-    In a row that is spared, variables may be texts.
     """
 
     def __init__(
-        self,
-        guard: Guard,
-        others: Sequence[str] = (),
-        clock: str = "time",
-        unit: str = "s",
-        spares: Callable[[Row], bool] = lambda row: False,
+        self, guard: Guard, others: Sequence[str] = (), clock: str = "time", unit: str = "s"
     ) -> None:
-        self._guard, self._spares, reviser = guard, spares, guard.reviser
+        self._guard, reviser = guard, guard.reviser
+        #: Whether variables of a row may be texts.
+        self.spares: Callable[[Row], bool] = lambda row: False
         #: Names of what is observed; empty where they have none, and come as a list.
         self.variables: tuple[str, ...] = guard.variables
         #: Whether the guard observes whole scenes.
@@ -179,7 +175,7 @@ class Form:
             if texts and kind is self._row:
                 row = self._message({**body, **dict.fromkeys(texts)}, in_si=in_si)
                 assert isinstance(row, Row)
-                if self._spares(row := structs.replace(row, told=row.told | texts)):
+                if self.spares(row := structs.replace(row, told=row.told | texts)):
                     return row
                 if in_si:
                     name, text = texts.popitem()
