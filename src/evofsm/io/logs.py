@@ -993,10 +993,10 @@ class _Reader:
         starts[0] = self._latest != tuple(key[0] for key in keys)
         self._latest = tuple(key[-1] for key in keys)
         rows = np.flatnonzero(starts)
-        texts, counts = (k.gather(rows) for k in keys), np.logical_or.reduceat(~piece.spared, rows)
-        for row, count, *episode in zip(rows.tolist(), counts, *texts, strict=True):
-            # Between batches nothing stands, or what does not count.
-            if count and any(map(str.strip, episode)) and tuple(episode) in self._known:
+        texts, ends = (key.gather(rows) for key in keys), [*rows[1:].tolist(), piece.rows]
+        for row, end, *episode in zip(rows.tolist(), ends[: len(rows)], *texts, strict=True):
+            is_back = tuple(episode) in self._known and any(map(str.strip, episode))
+            if is_back and not piece.spared[row:end].all():  # what is between batches comes back
                 names = ", ".join(self._episode)
                 raise ValueError(
                     f"{piece.at(row)}: the episode {', '.join(text[:40] for text in episode)} "

@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from functools import partial
+from functools import cached_property, partial
 from itertools import chain, zip_longest
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, NoReturn
 
@@ -359,10 +359,15 @@ class Piece:
     headers: Sequence[int] = ()  #: and those before which the columns are named again
     cut: str = ""  #: column in which the last row's field may go on, as nothing ends it
     bad: NDArray[np.bool_] = field(init=False)  #: (T,) rows to leave out
-    spared: NDArray[np.bool_] = field(init=False)  #: (T,) rows that need not be right
+    spares: Callable[[], NDArray[np.bool_]] | None = None  #: says which rows need not be right
 
     def __post_init__(self) -> None:
-        self.bad, self.spared = np.zeros((2, self.rows), np.bool_)
+        self.bad = np.zeros(self.rows, np.bool_)
+
+    @cached_property
+    def spared(self) -> NDArray[np.bool_]:
+        """(T,) rows that need not be right."""
+        return np.zeros_like(self.bad) if self.spares is None else self.spares()
 
     def at(self, row: int) -> str:
         """Where a row stands, for a message."""
@@ -376,7 +381,8 @@ class Piece:
 
     def leave_out(self, name: str, where: NDArray[np.bool_], why: str = "", hint: str = "") -> None:
         """Leave out rows for what stands in a column."""
-        for row in np.flatnonzero(where & ~self.bad & ~self.spared).tolist():
+        where = where & ~self.bad
+        for row in np.flatnonzero(where & ~self.spared if where.any() else where).tolist():
             self.skips.leave_out("field", partial(self.told, row, name, why, hint))
             self.bad[row] = True
 
@@ -442,8 +448,9 @@ class Wanted(NamedTuple):
         for name in self.texts:
             texts = frame[name].cast(polars.String)
             piece.texts[name] = texts.fill_null("") if texts.null_count() else texts
-        if self.spares:
-            piece.spared = self.spares(piece)
+        if self.spares:  # as it was read, whatever becomes of it
+            was = replace(piece, numbers={**piece.numbers}, texts={**piece.texts})
+            piece.spares = partial(self.spares, was)
         for name, rows in odd.items():
             piece.leave_out(name, rows)
         if self.dates:
