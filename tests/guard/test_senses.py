@@ -1,6 +1,7 @@
 """Observations that are late, come twice, after a gap in time, or with a sensor missing."""
 
 import math
+from contextlib import nullcontext
 from functools import cache
 
 import numpy as np
@@ -162,6 +163,19 @@ def test_a_clock_that_goes_back_is_followed_and_one_that_stands_still_sees_nothi
         assert all(one.intake is Intake.PARTIAL and np.isnan(one.observation).all() for one in then)
         assert math.isnan(revision.risk_proposed) == (kind == "learnt")
         assert twin.recognise(usual, others[-1] + 2 * dt).intake is Intake.GAP
+
+
+@pytest.mark.parametrize("steps", [(0.16, 0.16, 0.14), (100.0,), (0.1, 0.1, 8.0)])
+def test_times_that_are_mostly_too_far_apart_are_told_of(steps):
+    watch, time = Guard(-1.0, 1.0, interval=0.1), 0.0
+    said = pytest.warns(UserWarning, match=rf"latest {steps[0]:g} s, where interval is 0.1 s: noth")
+    with nullcontext() if steps[0] == 0.1 else said:
+        for k in range(400):
+            watch.decide([k % 7, k % 5], 0.0, time)
+            time += steps[k % len(steps)]
+            if k % 20 == 19:  # so short are episodes
+                watch.end(failed=k < 20)
+    assert "three in a row without NaN or a gap of over 1.5 intervals" in str(watch)
 
 
 def test_sensors_that_take_turns_are_put_together():

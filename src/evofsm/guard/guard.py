@@ -63,7 +63,7 @@ from evofsm.store import COUNT, SIZE, Kind, Numbers, Place
 _INTERVALS = 17
 # States of the machine that is made.
 _MOST_STATES = 200
-# So many observations on end that lack something are told of.
+# So many observations that lack something, or come after a gap, are told of.
 _MANY = 100
 # Longer than so many intervals is a gap in time; where more observations on end than the other come
 # no later than one before, its clock was set back, or stands still.
@@ -375,6 +375,7 @@ class Guard:
         self._under_way, self._passing, self._learn = False, "", True
         self._begun = self._decisions = self._acted = self._watched = self._kept = 0
         self._lacking = 0  # observations since one was whole
+        self._gaps = 0  # observations after a gap in time, less those without
         self.shadow = shadow
         self.learn = learn
 
@@ -514,7 +515,8 @@ class Guard:
             ``Proposal(action, mask=...)`` also says which actions are allowed now.
         time : float, optional
             Of the observation, in this episode [s]; without it decisions are counted, one every
-            `interval`. What is not later than the one before tells nothing new.
+            `interval`. What is not later than the one before tells nothing new; across more than
+            1.5 intervals nothing is learnt.
         episode : int, optional
             Its number, which `begin` returned: so several that feed one guard cannot mix their
             episodes up.
@@ -609,7 +611,8 @@ class Guard:
             intake = Intake.PARTIAL
             if len(self._held) == len(z):  # what was seen of them before is still held
                 latest_row = np.where(np.isnan(z), self._held, z)
-        if time < self._time or time - self._time > _GAP * self.interval:
+        self._count_gaps(step := time - self._time)  # NaN of an episode's first one
+        if step < 0.0 or step > _GAP * self.interval:
             intake |= Intake.GAP
         self._held, self._time = latest_row.copy(), time
         return intake, z
@@ -659,6 +662,18 @@ class Guard:
             warnings.warn(
                 f"none of {_MANY} observations on end was whole, and nothing is learnt from such: "
                 f"missing (NaN) is {names}. Leave it out of what is observed, or see to the sensor",
+                stacklevel=7,
+            )
+
+    def _count_gaps(self, step: float) -> None:
+        """Warn where most observations come after a gap in time: nothing is learnt across."""
+        is_late = step > max(_GAP * self.interval, getattr(self.judge, "bridges", 0.0))
+        self._gaps = self._gaps + 1 if is_late else max(0, self._gaps - 1)
+        if is_late and self._gaps == _MANY:
+            lag = f"the latest {step:.3g} s, where interval is {self.interval:g} s"
+            warnings.warn(
+                f"most observations come over {_GAP} intervals after the one before, {lag}: "
+                "nothing is learnt or carried across. Is the loop too slow, or is time not in s?",
                 stacklevel=7,
             )
 

@@ -40,7 +40,7 @@ from evofsm.guard.learnt.state import State
 NOTHING_LEARNT = "nothing was learnt yet"
 NEVER_WHOLE = (
     "nothing was learnt: no episode had four observations before it failed, three in a row without "
-    "NaN, with actions of the guard's range between them"
+    "NaN or a gap of over 1.5 intervals, with actions of the guard's range between them"
 )
 NOTHING_SEEN = "not each variable was observed yet in this episode"
 #: Said where it is far from all that was seen, or was not seen whole for long.
