@@ -597,8 +597,12 @@ def test_a_guard_in_print_says_what_it_learnt_from(reloaded, guard, row, says):
     assert says in str(guard)
     assert "episodes: 3, failures: 2, states: 1, frozen: no" in str(guard)
     guard.freeze()
-    guard.end(failed=True)
-    assert "failures: 2, states: 1, frozen: yes" in str(guard)
+    for failed in (False, True):
+        guard.end(failed=failed)
+        guard.freeze()
+    assert "failures: 2, states: 1, frozen: yes (1 of 2 episodes failed since)" in str(guard)
+    guard.learn = True
+    assert "frozen: no\n" in f"{guard}\n"
 
 
 def test_threads_share_a_guard_and_what_is_saved_meanwhile_loads(tmp_path):

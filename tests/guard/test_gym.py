@@ -771,6 +771,11 @@ def test_what_each_meets_is_learnt_whole_and_nothing_across_a_reset(name, steps,
     before = len(ended)
     revised.reset(seed=9)  # those under way end as they are
     assert len(guard.judge.episodes) == before + 3
+    guard.freeze()
+    drive_all(revised, 43)
+    failures = sum(failed for *_, failed in ended[before:])
+    assert f"({failures} of {len(ended) - before} episodes failed since)" in str(guard)
+    assert len(guard.judge.episodes) == before + 3
 
 
 def test_a_step_that_only_resets_is_no_decision_and_costs_nothing():

@@ -376,6 +376,7 @@ class Guard:
         self._begun = self._decisions = self._acted = self._watched = self._kept = 0
         self._lacking = 0  # observations since one was whole
         self._gaps = 0  # observations after a gap in time, less those without
+        self._since = 0, 0  # episodes that ended since it was frozen, and those that failed
         self.shadow = shadow
         self.learn = learn
 
@@ -409,6 +410,7 @@ class Guard:
     @transaction
     def learn(self, learn: bool) -> None:
         learn = self._learn = truth("learn", learn)
+        self._since = (0, 0) if learn else self._since
         if self.judge is not None and hasattr(self.judge, "learning"):
             self.judge.learning = learn
         self._under_way = False
@@ -862,6 +864,8 @@ class Guard:
                 judge.harm = judge.harm.after(counts, failed=failed, ended=terminated, score=score)
             self.n_episodes += 1
             self.n_failed += failed
+        else:
+            self._since = self._since[0] + 1, self._since[1] + failed
         if self.audit is not None:
             self.audit.ended(z, failed=failed, terminated=terminated, score=score)
 
@@ -880,13 +884,14 @@ class Guard:
             how += ", in shadow where in doubt" if self.shadow else ", harm is not noticed"
         latest = [] if self._observing is None else self._observing.harm.guarded
         of_late = f" ({sum(o.failed for o in latest)} of the latest {len(latest)} guarded)"
+        since = f" ({self._since[1]} of {self._since[0]} episodes failed since)" * any(self._since)
         lines = [
             f"{type(self).__name__} of {span}, each {self.interval:g} s",
             f"judge: {'none' if judge is None else type(judge).__name__} ({how})",
             f"episodes: {self.n_episodes}, failures: {self.n_failed}"
             f"{of_late if latest else ''}, states: "
             f"{0 if self.machine is None else self.machine.n_states}, "
-            f"frozen: {'no' if self._learn else 'yes'}",
+            f"frozen: {'no' if self._learn else 'yes'}{since}",
         ]
         if words := getattr(judge, "told_by_experience", ""):
             lines.append(f"failure: {words}")

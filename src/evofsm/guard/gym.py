@@ -429,10 +429,11 @@ class Lane:
     def end(self, *, failed: bool, terminated: bool = False, score: float | None = None) -> None:
         """The guard's episode ends, if one is under way."""
         decider, guard = self._guard, self.terms.guard
-        if decider is not None and (decider is guard or guard.learn):
+        if decider is not None:
             if decider is not guard:
                 self._episode = guard.begin(decider)
-            for step, (observation, proposal, executed) in enumerate(self._past):
+            rows = self._past if guard.learn else ()  # frozen, it only counts the episode
+            for step, (observation, proposal, executed) in enumerate(rows):
                 situation = guard.recognise(observation, step * guard.interval)
                 guard.revise(situation, proposal, executed)
             how: dict[str, Any] = {"terminated": terminated, "score": score}
