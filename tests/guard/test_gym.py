@@ -277,6 +277,10 @@ def test_what_does_not_fit_is_named():
     env.env.step = lambda action: (FAR, 0.0, 0.0, False, False, {})  # as Safety-Gymnasium
     with pytest.raises(ValueError, match=r"step returned 6 values, .* a cost belongs in info"):
         env.step(np.array([0.5]))
+    for first, what in ((np.zeros(2), "one ndarray"), ((1, 2, True), "3 values")):  # as of old Gym
+        env.env.reset = lambda *, first=first, **how: first
+        with pytest.raises(ValueError, match=rf"reset returned {what}, not 2 .* old Gym in a"):
+            env.reset()
     for name, given in product(("failed", "observe"), ("failed", {"failed": True})):
         with pytest.raises(TypeError, match=f"{name} is .* it must be a function, such as"):
             RevisedActions(Script(FAR), guard_for(ONE), **{name: given})
@@ -926,6 +930,29 @@ def test_what_an_agent_is_not_told_is_optional(silent):
     assert [(len(rows), end) for rows, end, _ in guard.judge.episodes] == [(1, last), (3, last)]
     assert sum(step.terminated for step in steps) == (0 if silent == "all" else 2)
     assert sum(math.isnan(step.reward) for step in steps) == 2 * (silent in ("rewards", "all"))
+
+
+@pytest.mark.parametrize("way", ["loop", "one", "agents"])
+def test_an_environment_may_tell_no_reward_and_no_info(way, monkeypatch):
+    def bare(call):
+        return lambda self, *given, **how: (*call(self, *given, **how)[:-1], None)
+
+    for name in ("reset", "step"):
+        monkeypatch.setattr(Script, name, bare(getattr(Script, name)))
+    monkeypatch.setattr(Script, "reward", None)
+    guard, script, push = guard_for(ONE, Spy(above_half)), Script(FAR, FAR, NEAR), np.array([2.5])
+    if way == "loop":
+        rewards = [one.reward for one in run_episode(script, guard, lambda seen: push)]
+    elif way == "one":
+        env = RevisedActions(script, guard, penalty=1.0)
+        rewards = [step[1] for step in drive(env, lambda seen, info: push)]
+    else:
+        env = RevisedAgents(Crowd(3), guard, penalty=1.0)
+        rewards = [step[1]["a0"] for step in drive_agents(env, 2.5)]
+    assert np.isnan(np.array(rewards, float)).tolist() == [True, True]
+    assert [(len(rows), end, failed) for rows, end, failed in guard.judge.episodes] == [
+        (2, tuple(NEAR), True)
+    ]
 
 
 def test_whom_anothers_failure_ends_did_not_end_by_itself():

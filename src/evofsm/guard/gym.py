@@ -32,7 +32,7 @@ from evofsm.guard.actions import (
 )
 from evofsm.guard.api import Proposal, Revision
 from evofsm.guard.guard import Guard, answered
-from evofsm.guard.loop import action_masks
+from evofsm.guard.loop import action_masks, parts_of
 from evofsm.guard.reviser import make_usable, passed, unjudged_revision
 
 with needs("gymnasium", "gym", "a wrapper for Gymnasium"):
@@ -176,14 +176,15 @@ class RevisedActions(_Settled, gymnasium.Wrapper[Any, Any, Any, Any], RecordCons
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode; one that is under way ends without failure."""
         self._lane.end(failed=False)
-        observation, info = self.env.reset(seed=seed, options=options)
+        observation, info = parts_of(self.env.reset(seed=seed, options=options))
         self._lane.begin(observation, info)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Execute the guard's revision of ``action``."""
         was_open, decision = self._lane.is_open, self._lane.decide(action)
-        observation, reward, terminated, truncated, info = five(self.env.step(decision.executed))
+        parts = parts_of(self.env.step(decision.executed), 5)
+        observation, reward, terminated, truncated, info = parts
         self._lane.follow(StepResult(observation, reward, bool(terminated), bool(truncated), info))
         if self._lane.is_open and not was_open and not self._resets_itself:
             self._resets_itself = True
@@ -261,7 +262,7 @@ class RevisedVectorActions(_Settled, VectorWrapper[Any, Any, Any, Any, Any]):
     ) -> tuple[Any, dict[str, Any]]:
         """Begin episodes, in all or those of ``options["reset_mask"]``; those under way end."""
         mask = np.array((options or {}).get("reset_mask", np.ones(self.num_envs, bool)))
-        observations, infos = self.env.reset(seed=seed, options=options)
+        observations, infos = parts_of(self.env.reset(seed=seed, options=options))
         rows = iterate(self.env.observation_space, observations)
         for k, (lane, observation) in enumerate(zip(self._lanes, rows, strict=True)):
             if mask[k]:
@@ -277,7 +278,7 @@ class RevisedVectorActions(_Settled, VectorWrapper[Any, Any, Any, Any, Any]):
         space = self.single_action_space
         buffer: Any = create_empty_array(space, self.num_envs)
         executed = concatenate(space, [decision.executed for decision in decisions], buffer)
-        observations, rewards, terminated, truncated, infos = five(self.env.step(executed))
+        observations, rewards, terminated, truncated, infos = parts_of(self.env.step(executed), 5)
         rows = iterate(self.env.observation_space, observations)
         for k, (lane, observation) in enumerate(zip(self._lanes, rows, strict=True)):
             ends, info = (bool(terminated[k]), bool(truncated[k])), _of_one(infos, k, self.num_envs)
@@ -317,7 +318,7 @@ class Decided(NamedTuple):
 
     def paid(self, reward: Any) -> Any:
         """The reward less the cost; of several, each."""
-        if not self.cost:
+        if not self.cost or reward is None:
             return reward
         return (float(reward) if np.ndim(reward) == 0 else np.asarray(reward)) - self.cost
 
@@ -416,7 +417,7 @@ class Lane:
             step = replace(step, observation=last[0] if last else None, info=info)
         failed = self.terms.failed(step)
         resets = is_over and (resets or bool(last))
-        self._score += np.sum(step.reward)
+        self._score += np.sum(np.array(step.reward, float))  # NaN of None
         self._look(step.observation, step.info)
         if failed or is_over or self.seen is None:
             score = float(self._score) if is_over and np.isfinite(self._score) else None
@@ -631,15 +632,6 @@ def refuse_unless(fits: bool, env: Any) -> None:
             "PettingZoo, as parallel_env() makes it, or pettingzoo.utils.aec_to_parallel(env); "
             "wrap the single environments of a VecEnv of Stable-Baselines3"
         )
-
-
-def five(parts: Any) -> Any:
-    """What a step returned, unless it has other parts than those of Gymnasium."""
-    if len(parts) != 5:
-        fault = f"the environment's step returned {len(parts)} values, not 5 as Gymnasium has them"
-        hint = "a cost belongs in info['cost'], where SafetyGymnasium2Gymnasium puts its own"
-        raise ValueError(f"{fault}: {hint}")
-    return parts
 
 
 def _spaces(env: Any) -> tuple[Space[Any], Space[Any]]:

@@ -84,7 +84,7 @@ def run_episode(
     (False, True)
     """
     propose = getattr(controller, "propose", None) or (lambda seen, time: controller(seen))  # type: ignore[operator]
-    observation, info = environment.reset(seed=seed, options=options)
+    observation, info = parts_of(environment.reset(seed=seed, options=options))
     number, mask_of = guard.begin(), action_masks(environment)
     latest_row, count, score, is_over, failed = _whole(observation, None), 0, 0.0, False, False
     while not is_over:
@@ -95,15 +95,29 @@ def run_episode(
         begin = perf_counter()
         revision = guard.decide(np.ravel(observation), proposal, time, episode=number)
         seconds, situation = perf_counter() - begin, guard.situation
-        observation, reward, terminated, truncated, info = environment.step(revision.executed)
-        latest_row, count, score = _whole(observation, latest_row), count + 1, score + float(reward)
+        parts = parts_of(environment.step(revision.executed), 5)
+        observation, reward, terminated, truncated, info = parts
+        reward = math.nan if reward is None else float(reward)
+        latest_row, count, score = _whole(observation, latest_row), count + 1, score + reward
         is_over, failed = bool(terminated or truncated), bool(info.get("failed", terminated))
         if is_over:
             how: Any = {"terminated": bool(terminated), "episode": number}
             how["score"] = score if math.isfinite(score) else None
             guard.end(failed, np.ravel(observation), **how)
         effect = float(info.get("realised", math.nan))
-        yield Decision(situation, revision, effect, float(reward), failed, seconds)
+        yield Decision(situation, revision, effect, reward, failed, seconds)
+
+
+def parts_of(reply: Any, count: int = 2) -> Any:
+    """What a reset, or a step (5), returned, an info of None as {}; other parts are refused."""
+    is_parted = isinstance(reply, tuple | list)
+    if not (is_parted and len(reply) == count):
+        kind = f"{len(reply)} values" if is_parted else f"one {type(reply).__name__}"
+        call = "reset" if count == 2 else "step"
+        fault = f"the environment's {call} returned {kind}, not {count} values as Gymnasium's"
+        hint = "a cost belongs in info['cost'] (SafetyGymnasium2Gymnasium), old Gym in a wrapper"
+        raise ValueError(f"{fault}: {hint}")
+    return *reply[:-1], {} if reply[-1] is None else reply[-1]
 
 
 def action_masks(environment: Any) -> Callable[[Any, Mapping[str, Any]], Any]:

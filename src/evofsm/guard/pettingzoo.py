@@ -12,6 +12,7 @@ from evofsm.guard import gym
 from evofsm.guard.api import Revision
 from evofsm.guard.guard import Guard
 from evofsm.guard.gym import Failed, Lane, Observe, StepResult, Terms
+from evofsm.guard.loop import parts_of
 
 with needs("pettingzoo", "pettingzoo", "a wrapper for PettingZoo"):
     from pettingzoo import AECEnv, ParallelEnv
@@ -76,7 +77,7 @@ class RevisedAgents(gym._Settled, BaseParallelWrapper[Any, Any, Any]):  # type: 
         for lane in self._lanes.values():
             lane.end(failed=False)
             lane.is_open = False
-        observations, infos = self.env.reset(seed=seed, options=options)
+        observations, infos = parts_of(self.env.reset(seed=seed, options=options))
         self._begin(observations, infos)
         return observations, infos
 
@@ -84,14 +85,14 @@ class RevisedAgents(gym._Settled, BaseParallelWrapper[Any, Any, Any]):  # type: 
         """Execute the guard's revision of each agent's action."""
         decisions = {agent: self._enter(agent).decide(action) for agent, action in actions.items()}
         executed = {agent: decision.executed for agent, decision in decisions.items()}
-        observations, rewards, terminated, truncated, infos = gym.five(self.env.step(executed))
+        observations, rewards, terminated, truncated, infos = parts_of(self.env.step(executed), 5)
         infos, rewards = dict(infos), dict(rewards)
         alive, steps = {*self.env.agents}, dict[Any, StepResult]()
         for agent in (agent for agent, lane in self._lanes.items() if lane.is_open):
             is_over, has_left = bool(terminated.get(agent)), agent not in alive
             ends = is_over, bool(truncated.get(agent)) or (has_left and not is_over)
             row, reward = observations.get(agent), rewards.get(agent, math.nan)
-            steps[agent] = StepResult(row, reward, *ends, infos.get(agent, {}))
+            steps[agent] = StepResult(row, reward, *ends, infos.get(agent) or {})
         over = [agent for agent, step in steps.items() if step.terminated]
         if len(over) > 1:  # whom another's failure ends does not end by itself
             fails = {agent: self._lanes[agent].terms.failed(steps[agent]) for agent in over}
@@ -107,7 +108,7 @@ class RevisedAgents(gym._Settled, BaseParallelWrapper[Any, Any, Any]):  # type: 
             if agent in rewards:
                 rewards[agent] = decision.paid(rewards[agent])
             if agent in infos or agent in terminated:
-                infos[agent] = {**infos.get(agent, {}), **decision.info}
+                infos[agent] = {**(infos.get(agent) or {}), **decision.info}
         here = {agent: row for agent, row in observations.items() if agent in self.env.agents}
         self._begin(here, infos)
         return observations, rewards, terminated, truncated, infos
@@ -115,7 +116,7 @@ class RevisedAgents(gym._Settled, BaseParallelWrapper[Any, Any, Any]):  # type: 
     def _begin(self, observations: _Each, infos: _Each) -> None:
         agents = [agent for agent in observations if not self._enter(agent).is_open]
         for agent in agents:
-            self._lanes[agent].begin(observations[agent], infos.get(agent, {}))
+            self._lanes[agent].begin(observations[agent], infos.get(agent) or {})
         lanes = self._lanes.items() if agents else ()
         sizes = {agent: len(lane.seen) for agent, lane in lanes if lane.seen is not None}
         if len({*sizes.values()}) > 1:
