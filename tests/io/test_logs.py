@@ -276,7 +276,9 @@ def test_parquet_with_holes_texts_or_half_a_file_is_refused(tmp_path, monkeypatc
     ):
         frame.write_parquet(path)
         assert said in refusal(str(path))
-    whole.write_parquet(path)
+    lasting = polars.duration(milliseconds=1000 * polars.col("time"))
+    whole.with_columns(time=lasting).write_parquet(path)
+    assert read(str(path))[0].times == pytest.approx(whole["time"].to_numpy())
     path.write_bytes(path.read_bytes()[:-50])
     assert "cannot be read as Parquet" in refusal(str(path))
     monkeypatch.setitem(sys.modules, "polars", None)
@@ -539,11 +541,11 @@ def test_rows_without_a_leader_end_an_episode(tmp_path, pieces, nothing):
     assert "1 failure lies in rows that are left out" in " ".join(warnings_of(noted))
 
 
-@pytest.mark.parametrize("sign", "\t|")
+@pytest.mark.parametrize("sign", "\t|,")
 @pytest.mark.parametrize("first", ["10,125", "20"])
 def test_decimal_commas_are_known_by_one_that_parts_no_thousands(tmp_path, sign, first):
     gaps = [first] * 6 + ["12,375"]
-    rows = [f"{k} {gap} 10 {'0,125' if k == 6 else 9} 1" for k, gap in enumerate(gaps)]
+    rows = [f'{k} "{gap}" 10 "{"0,125" if k == 6 else 9}" 1' for k, gap in enumerate(gaps)]
     header = "time gap v_follower v_leader a_follower".replace(" ", sign)
     path = write(tmp_path / "a.csv", [row.replace(" ", sign) for row in rows], header)
     assert together(path)[0] == [float(gap.replace(",", ".")) for gap in gaps]

@@ -515,7 +515,7 @@ class Dialect:
             self.units, rows = dict(zip(self.columns, units, strict=False)), rows[self.n_told :]
         self.first_row = rows[0] if rows else []
         self.has_commas = self.separator == ";"
-        if self.separator in "\t|":
+        if self.separator in ",\t|":  # at commas, within quotes
             self.has_commas = _has_decimal_commas(zip_longest(*rows, fillvalue=""))
 
     def miscounted(self, count: int, named: int) -> str:
@@ -664,6 +664,8 @@ class CsvTable(Table):
         kinds: dict[str, Any] = {f"column_{k + 1}": polars.String for k in range(len(columns))}
         numbers = {place: polars.Float64 for place, name in names.items() if name in wanted.numbers}
         separator, has_commas = self._dialect.separator, self._dialect.has_commas
+        if has_commas and separator == ",":
+            return None
         dialect: Any = {"separator": separator, "decimal_comma": has_commas}
         for schema in (kinds | numbers, kinds):
             try:
@@ -735,10 +737,13 @@ class ParquetTable(Table):
     def __init__(self, path: str, skips: Skips | None = None) -> None:
         with needs("polars", "tables", f"{path}: Parquet"):
             import polars
+            from polars import selectors
         self.path, self.skips = path, skips or Skips()
         # polars takes other paths for addresses on the network, or of somebody's home.
         self._scan = polars.scan_parquet(os.path.abspath(path), glob=False)
         with readable(self.path, _AS_PARQUET):
+            seconds = selectors.duration().dt.total_nanoseconds() / 1e9
+            self._scan = self._scan.with_columns(seconds)
             self._types = self._scan.collect_schema()
             self._rows = int(self._scan.select(polars.len()).collect().item())
         self.columns = list(self._types)
