@@ -139,6 +139,10 @@ LOOKED_AT = {
     "Stamp": (lambda k: f"{at(k * 60):%d-%b-%y %H:%M}".upper(), "--unit 'Stamp=%d-%b-%y %H:%M'"),
     "Day": (lambda k: f"{45945 + k / 288:.6f}".replace(".", "@"), "--unit Day=d"),
     "Date,Time": (lambda k: f"{at(k):%d/%m/%Y,%H:%M}", "--time Date,Time"),
+    "Datum,Uhrzeit": (
+        lambda k: f"{at(k - 1):%d.%m.%Y},{at(k):%H:%M}".replace(",00:00", ",24:00"),
+        "--time Datum,Uhrzeit",
+    ),
     "Zeit": (lambda k: f"{at(k):%Y-%m-%d %H:%M:%S}@5", "the clock Zeit"),
     "time": (lambda k: 600 - k, "time runs backwards"),
     "__time": (lambda k: k, "--time __time "),

@@ -49,7 +49,7 @@ _FASTEST, _LONGEST_USUAL = 60.0, 5.0
 # Two witnesses of one thing are compared in more rows than so, and where they go up and down
 # together as far as that (a correlation).
 _COMPARED, _CORRELATED = 50, 0.9
-_SPEED = re.compile(r"v([_0-9]|$)|.*(speed|velocity)", re.IGNORECASE)
+_SPEED = re.compile(r"v([_0-9]|$)|.*((?i:speed|velocity))")  # V are volts
 _MICROSECOND = 1e-6
 #: A date with a zone; months in which clocks are put on or back.
 ZONE, _CHANGES = re.compile(r"(Z|UTC|[+-]\d\d:?\d\d)$"), (3, 4, 9, 10, 11)

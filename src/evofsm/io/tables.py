@@ -12,7 +12,7 @@ import zlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from functools import cached_property, partial
 from itertools import chain, zip_longest
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, NoReturn
@@ -108,6 +108,7 @@ _DATE = re.compile(r"\s*\d{4}-?\d\d-?\d\d[Tt ]")
 # The day first, as only dots tell; whether its year has a century, and whether seconds follow.
 _DAY_FIRST = re.compile(r"\d\d?\.\d\d?\.(?:(\d{4})|\d\d),?[T ]+\d\d?:\d\d(:)?")
 _DATE_LIKE = re.compile(r"\s*(\d{1,4}|[A-Z][a-z]{2,8})([.:/ -])(\d\d?|[A-Za-z]{3,9})(\2|, )\d")
+_MIDNIGHT = "([T ])24:00"  # at the end of a day
 _NO_DATE = 3e9  # from here on it is none: days of Excel in seconds, or another unit [s]
 #: What is said where times of day are not as they stand in a log.
 IN_UTC = "times of day are told in UTC"
@@ -376,7 +377,8 @@ class Piece:
     def told(self, row: int, name: str, why: str = "", hint: str = "") -> str:
         """Where a row stands, and what is wrong with what it has in a column."""
         place, fields = self.find(row)
-        text = "" if fields[name] is None else str(fields[name])
+        parts = [fields[part] for part in ([name] if name in fields else name.split(","))]
+        text = " ".join("" if part is None else str(part) for part in parts)
         return f"{place}, column {name!r}: {why.format(text[:40]) or explained(text, hint)}"
 
     def leave_out(self, name: str, where: NDArray[np.bool_], why: str = "", hint: str = "") -> None:
@@ -457,8 +459,8 @@ class Wanted(NamedTuple):
             dates = frame[self.dates[0]]
             for name in self.dates[1:]:  # the time of day, behind the date
                 dates = dates.cast(polars.String) + " " + frame[name].cast(polars.String)
-            numbers = _microseconds(piece, self.dates[0], dates, self.form)
-            piece.numbers[",".join(self.dates)] = numbers
+            name = ",".join(self.dates)
+            piece.numbers[name] = _microseconds(piece, name, dates, self.form)
         return piece
 
 
@@ -852,10 +854,10 @@ def date(time: float, unit: str = "") -> str:
 def seconds_of_date(text: str, form: str = "") -> float:
     """Since 1970, of one date as logs are read; a ValueError if it is none.
 
-    >>> seconds_of_date("01.01.1970 00:01:30,5"), seconds_of_date("1970-01-01T01:00:00+01:00")
-    (90.5, 0.0)
+    >>> seconds_of_date("01.01.1970 00:01:30,5"), seconds_of_date("1970-01-01T24:00:00+01:00")
+    (90.5, 82800.0)
     """
-    text = text.strip()
+    text, n_ends = re.subn(_MIDNIGHT, r"\g<1>00:00", text.strip())
     if form:
         when = datetime.strptime(text, form)
     else:
@@ -863,7 +865,7 @@ def seconds_of_date(text: str, form: str = "") -> float:
             day, month, year, hour, rest = match.groups()
             text = f"{'20' * (len(year) == 2)}{year}-{month:0>2}-{day:0>2} {hour:0>2}{rest}"
         when = datetime.fromisoformat(text)
-    return when.replace(tzinfo=when.tzinfo or UTC).timestamp()
+    return when.replace(tzinfo=when.tzinfo or UTC).timestamp() + 86400.0 * n_ends
 
 
 def is_number(text: str) -> bool:
@@ -897,12 +899,16 @@ def _microseconds(
         form = form.replace(",%f", ".%f").replace(".%f", "%.f").replace("%f", "%6f")  # as polars
         if "," not in form and texts.str.contains(",", literal=True).any():
             texts = texts.str.replace(r",\s+", " ").str.replace(",", ".", literal=True)
+        ends = texts.str.contains(_MIDNIGHT)
+        texts = texts.str.replace(_MIDNIGHT, "${1}00:00") if ends.any() else texts
         try:
             dates = texts.str.to_datetime(form or None, strict=False)
             if parts and dates.null_count():  # which is slower
                 dates = texts.str.to_datetime(form + parts, strict=False)
         except polars.exceptions.ComputeError:  # it knows no form from the first one
             dates = polars.Series(name, [None] * len(texts), polars.Datetime("us"))
+        if ends.any():
+            dates += ends.cast(polars.Int64) * timedelta(days=1)
     if dates.null_count():
         piece.leave_out(name, dates.is_null().to_numpy(), f"{why}{_SAYS_HOW}")
     return dates.dt.epoch("us").cast(polars.Float64).to_numpy()
