@@ -143,6 +143,9 @@ LOOKED_AT = {
         lambda k: f"{at(k - 1):%d.%m.%Y},{at(k):%H:%M}".replace(",00:00", ",24:00"),
         "--time Datum,Uhrzeit",
     ),
+    "Elapsed [h]": (lambda k: f"{k / 3600:.6f}".replace(".", "@"), "--unit 'Elapsed [h]=h'"),
+    "Timestamp": (lambda k: f"{at(k):%Y%m%d%H%M%S}", "--unit Timestamp=%Y%m%d%H%M%S"),
+    "timestamp,roll": (lambda k: f"{12349657 + 60 * k},{k % 5}", "the clock timestamp rows"),
     "Zeit": (lambda k: f"{at(k):%Y-%m-%d %H:%M:%S}@5", "the clock Zeit"),
     "time": (lambda k: 600 - k, "time runs backwards"),
     "__time": (lambda k: k, "--time __time "),
@@ -182,6 +185,20 @@ def test_rows_meet_a_failure_that_is_proposed_in_the_log_and_live(evofsm, field,
     assert "1 episode ended with f==" in said(evofsm(*shlex.split(command)))
     Path("row.json").write_text(json.dumps({"time": 0, "level": 3, "f": live}))
     assert json.loads(evofsm("monitor", "row.json", "--guard", "guard.evofsm").stdout)["failed"]
+
+
+def test_a_first_look_asks_of_a_clock_that_it_cannot_read(evofsm):
+    clocks = {
+        "time": (lambda k: f"2025-{62 + k:03}T06:00:00", "time, dates that are not read"),
+        "tick_ms": (lambda k: (2**32 - 999_000 + 10_000 * k) % 2**32, "did the clock begin anew?"),
+    }
+    for name, (clock, said) in clocks.items():
+        rows = (f"{clock(k)},{k % 7},{k % 99 == 98}" for k in range(300))
+        Path("log.csv").write_text("\n".join([f"{name},level,f", *rows]))
+        looked = evofsm("learn", "log.csv").stdout
+        assert said in " ".join(looked.split())
+        assert f"--time {name}" in looked
+        assert "--where" not in looked
 
 
 def test_a_row_of_each_signal_becomes_a_column_as_it_is_advised(evofsm):

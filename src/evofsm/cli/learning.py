@@ -29,12 +29,15 @@ from evofsm.guard.actions import limits
 from evofsm.guard.foresight import span
 from evofsm.io import Chunk, LogColumns, episodes_of, read_traces
 from evofsm.io.logs import Noted
-from evofsm.io.tables import IN_UTC, SI, TIMES, UNITS, quoted_name
+from evofsm.io.tables import IN_UTC, SI, TIMES, UNITS, quoted_name, unit_of
 
 # A unit at the end of a column's name, behind another letter or as a word of its own.
 _WORD = "(?:^|[^A-Za-z]|(?<=[a-z])(?=[A-Z]))"
 _CALLED = re.compile(_WORD + "((?i:km[/_ ]?p?h|kph|mph|knots|feet|ft|cm|mm|km))[^A-Za-z]*$")
-_TIME_CALLED = re.compile(_WORD + "((?i:ms|us|ns))(?:ec)?[^A-Za-z]*$")
+_TIME_CALLED = re.compile(
+    _WORD + "((?i:[mnu\u00b5\u03bc]s|min(?:ute)?s?|h(?:ou)?rs?|days?|(?<![A-Za-z])[hd]))"
+    "(?:ec)?[^A-Za-z]*$"
+)
 # Units of time that logs are in, of which that counts by which a row comes every 0.1 s or so.
 _SHORTER = ("ms", "us", "ns")
 _MATCHES = 0.02  # so near must a unit come to what two columns differ by, to be named
@@ -109,8 +112,8 @@ def unit_in(name: str, *, is_time: bool) -> str:
     match = (_TIME_CALLED if is_time else _CALLED).search(name)
     if match is None:
         return ""
-    word = match[1].lower()
-    return {"feet": "ft", "knots": "kn"}.get(word) or (word if word in UNITS else "km/h")
+    unit = unit_of(match[1].lower())
+    return {"feet": "ft"}.get(unit) or (unit if unit in UNITS else "km/h")
 
 
 def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:

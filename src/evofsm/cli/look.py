@@ -28,17 +28,22 @@ Rows = NDArray[np.int64]
 # So many fields and rows are looked at; columns of more texts are no list of states.
 _MOST_FIELDS, _ROWS_LOOKED_AT, _MOST_TEXTS = 20_000_000, 500_000, 12
 _EPOCHS = {"ns": 1e9, "us": 1e6, "ms": 1e3, "s": 1.0}  # times since 1970 are larger by far
-_COLUMNS_SHOWN = 40  # columns
+_COLUMNS_SHOWN, _RISING = 40, 0.9  # columns; in so many steps rises what only counts
 _SIGNS = "<>=! "  # what in a name of a condition is ambiguous
 _FAR = 2.0  # far outside is what lies so many ranges of 99 % of the rows beyond them
 _NEAR = 3  # rows before a failure that are never proposed to be left out
 # A larger share of steps, and so many, that are no usual one make no clock; of bad rows no log.
 _ODD, _MANY, _MANY_BAD = 0.001, 10, 0.05
-_TIME = re.compile(r"ts?[\W_]*([mun]?s)?\W*$|(time|zeit|timestamp|sec|epoch)([^a-z]|$)", re.I)
-_CLOCK = re.compile("times?|timestamps?|stamps?|sec(ond)?s?|epoch|elapsed|zeit(stempel)?", re.I)
+_NAME = "(time|zeit|timestamp|sec|epoch|x_value)([^a-z]|$)"  # the last is LabVIEW's
+_TIME = re.compile(rf"ts?([\W_]*[mun]?s|[\W_]+(min|h|d))?\W*$|{_NAME}", re.IGNORECASE)
+_CLOCK = re.compile(
+    "times?|timestamps?|stamps?|ticks?|sec(ond)?s?|epoch|elapsed|zeit(stempel)?", re.IGNORECASE
+)
 _FRAME = re.compile("frame([^a-z]|$)", re.IGNORECASE)  # it counts steps of the same length
 # Other dates: the year first, or the day or the month, which may be a name.
 _OTHER = re.compile(r"(\d+)([/ -])(\w+)\2(\d{2,4})(,? )\d\d?:\d\d(:\d\d(\.\d+)?)?( [AP]M)?$", re.I)
+# Numbers that are dates, by how many digits they have; no clock since 1970 has so many.
+_COMPACT = {14: "%Y%m%d%H%M%S", 12: "%Y%m%d%H%M"}
 _WORDS = re.compile(r"[A-ZÄÖÜ]+(?![a-zäöüß])|[A-ZÄÖÜ]?[^\W\d_A-ZÄÖÜ]+")  # in a name
 # What somebody sets is called so, or has such a word; or one of these, and none of the last.
 _ACTION = re.compile("u|acc(el(eration)?)?", re.IGNORECASE)
@@ -198,8 +203,10 @@ def _first_rows(
     firsts = {name: table.first(name).strip() for name in table.columns if table.holds(name)}
     pairs = [*zip(firsts, [*firsts][1:], strict=False)]
     date_columns = [name for name, text in firsts.items() if is_date(text)]
-    apart = (pair for pair in pairs if pair[0] not in date_columns)
-    together = (f"{a},{b}" for a, b in apart if is_date(f"{firsts[a]} {firsts[b]}"))
+    alone = (pair for pair in pairs if pair[0] not in date_columns)
+    together = (
+        f"{a},{b}" for a, b in alone if ":" in firsts[b] and is_date(f"{firsts[a]} {firsts[b]}")
+    )
     early = next(table.pieces(Wanted([], date_columns))).texts if date_columns else {}
     table.skips.kinds.clear()  # said where all rows are read
     clocks = (name for name, dates in early.items() if dates.n_unique() > 1)  # no date of an export
@@ -226,7 +233,9 @@ def _first_rows(
                 odd[f"in column {name!r}, the first: {str(bad.first())!r}"] = len(bad)
     texts = [name for name in texts if frame[name].dtype == polars.String]
     numbers = [name for name in firsts if name in frame.columns and frame[name].dtype.is_numeric()]
-    titles = [names for names in [*zip(texts, strict=True), *pairs] if {*names} <= {*texts}]
+    compact = [(name,) for name in numbers if 1.99e11 < (frame[name][0] or 0.0) < 2.1e13]
+    apart = (names for names in [*zip(texts, strict=True), *pairs] if {*names} <= {*texts})
+    titles = [*compact, *apart]
     for names in titles if not clock else ():
         if not clock and (outcome := _dates(frame, names, asides)):
             dates, (frame, clock, form) = [*names], outcome
@@ -246,7 +255,8 @@ def _first_rows(
         frame = frame.with_columns(polars.Series(clock, at + 3600.0 * hours))
     since = ", a number of steps (--dt)" if _FRAME.match(clock) else since
     if not clock:  # of texts that look like dates --unit says more
-        like_dates = (n for n in texts if "a date?" in explained(firsts[n]))
+        like_dates = [n for n in texts if "a date?" in explained(firsts[n])]
+        like_dates += [n for n in texts if _TIME.match(n)]
         form = next((n for n in like_dates if frame[n].n_unique() > _MOST_TEXTS), "")
         since = f"{form}, dates that are not read: --unit says how ({form}=%d-%b-%y)" * bool(form)
     asides.insert(0, ("the clock", clock + since or "no column (--dt)"))
@@ -280,12 +290,33 @@ def _clock_of(frame: polars.DataFrame, names: Sequence[str]) -> tuple[str, str, 
 def _dates(
     frame: polars.DataFrame, names: Sequence[str], asides: Pairs
 ) -> tuple[polars.DataFrame, str, str] | None:
-    """Rows with dates as `_OTHER` has them, in one column or two; None of others."""
-    texts = frame[names[0]]
+    """Rows with dates as `_forms` has them, in one column or two; None of others."""
+    texts, is_text = frame[names[0]], frame[names[0]].dtype == polars.String
+    texts = texts if is_text else texts.cast(polars.Int64, strict=False)
+    texts = texts.cast(polars.String)
     for name in names[1:]:
         texts = texts + " " + frame[name]
-    if not (match := _OTHER.match(str(texts[0]))) or texts.n_unique() < 2:
+    if not (forms := _forms(str(texts[0]))) or texts.n_unique() < 2:
         return None
+    read = {}
+    for form in forms:
+        at = texts.str.to_datetime(form.replace(".%f", "%.f"), strict=False).dt.epoch("us")
+        read[form] = at.null_count(), int(_odd(np.diff(at.drop_nulls())).sum()), at
+    form = min(read, key=lambda form: read[form][:2])
+    if 2 * read[form][0] * (1 if is_text else len(texts)) > len(texts):  # numbers are all dates
+        return None
+    if len({faults[:2] for faults in read.values()}) < len(read):
+        text = f"day or month first cannot be told of {texts[0]}; it is read as {form} (--unit)"
+        asides.append(("the dates", text))
+    clock = ",".join(names)
+    frame = frame.drop(names).with_columns(read[form][2].cast(polars.Float64).alias(clock))
+    return frame, clock, f"{clock}={form}"
+
+
+def _forms(text: str) -> list[str]:
+    """How a date may be written that is no date of ISO 8601, the likeliest first."""
+    if not (match := _OTHER.match(text)):
+        return [_COMPACT[len(text)]] if text.isdigit() and len(text) in _COMPACT else []
     first, sign, second, third, space, has_seconds, has_parts, half = match.groups("")
     year = "%Y" if len(first + third) > 4 else "%y"
     month = "%m" if second.isdigit() else "%B" if len(second) > 3 else "%b"
@@ -293,19 +324,8 @@ def _dates(
     days = [("%Y", month, "%d")] if len(first) == 4 else days
     hour = space + ("%I:%M" if half else "%H:%M")
     hour += ":%S" * bool(has_seconds) + ".%f" * bool(has_parts) + " %p" * bool(half)
-    read = {}
-    for day in map(sign.join, days[:: -1 if half else 1]):  # who writes AM has the month first
-        at = texts.str.to_datetime(day + hour.replace(".%f", "%.f"), strict=False).dt.epoch("us")
-        read[day] = at.null_count(), int(_odd(np.diff(at.drop_nulls())).sum()), at
-    day = min(read, key=lambda day: read[day][:2])
-    if 2 * read[day][0] > len(texts):
-        return None
-    if len({faults[:2] for faults in read.values()}) < len(read):
-        text = f"day or month first cannot be told of {texts[0]}; it is read as {day} (--unit)"
-        asides.append(("the dates", text))
-    clock = ",".join(names)
-    frame = frame.drop(names).with_columns(read[day][2].cast(polars.Float64).alias(clock))
-    return frame, clock, f"{clock}={day}{hour}"
+    days = days[:: -1 if half else 1]  # who writes AM has the month first
+    return [sign.join(day) + hour for day in days]
 
 
 def _odd(steps: Floats) -> NDArray[np.bool_]:
@@ -346,7 +366,8 @@ def _of_steps(at: Floats, segments: Floats, facts: Pairs, lacking: int) -> tuple
     n_twice, n_earlier = int((steps == 0.0).sum()), int((at < latest).sum())
     if 20 * n_earlier > len(at):  # one time is wrong, not so many
         when = tables.date(float(np.median(latest[at < latest])))
-        facts.append(("late rows", f"{n_earlier:,}, after a row of {when}: is its time right?"))
+        cause = "is its time right, or did the clock begin anew?"
+        facts.append(("late rows", f"{n_earlier:,}, after a row of {when}: {cause}"))
         n_earlier = 0
     if odd.sum() + lacking < max(_MANY, _ODD * len(steps)):
         return [], n_twice + n_earlier
@@ -396,7 +417,10 @@ def _is_set(name: str) -> bool:
 
 def _stands(z: Floats) -> bool:
     """Whether numbers are near 0 for a while, and else far from it."""
-    size = np.abs(z[np.isfinite(z)])
+    z = z[np.isfinite(z)]
+    if np.mean(np.diff(z) > 0.0) > _RISING:  # a count of ticks, which may begin anew
+        return False
+    size = np.abs(z)
     low, mid = (float(np.mean(size < x * np.quantile(size, 0.95))) for x in (0.05, 0.5))
     return 0.01 < low < 0.9 and mid - low < 0.02 and len(np.unique(size)) > _MOST_TEXTS
 

@@ -96,7 +96,8 @@ UNITS = {unit: factor for group in _GROUPS.values() for unit, factor in group.it
 #: Of each unit the one that it is turned into.
 SI = {unit: base for base, group in _GROUPS.items() for unit in group}
 _SPELT = {"kmh": "km/h", "kph": "km/h", "kmph": "km/h", "km/hr": "km/h", "mps": "m/s", "sec": "s"}
-_SPELT |= {"day": "d", "days": "d"}
+_SPELT |= {"day": "d", "days": "d", "hour": "h", "hours": "h", "hr": "h", "hrs": "h"}
+_SPELT |= {"minute": "min", "minutes": "min", "mins": "min", "msec": "ms", "usec": "us"}
 _SPELT |= {"\u00b5s": "us", "\u03bcs": "us", "knots": "kn", "kt": "kn", "m/s/s": "m/s2"}
 _COMMENTS = re.compile(r"([ \t]*(#|%|//).*\n|[^\S\n]*\n)*")  # lines of them, and empty ones
 _COMMENT = re.compile(r"\A\s*(#|%|//)+\s*")  # what stands before the last line of a comment
