@@ -201,12 +201,31 @@ def test_a_first_look_asks_of_a_clock_that_it_cannot_read(evofsm):
         assert "--where" not in looked
 
 
-def test_a_row_of_each_signal_becomes_a_column_as_it_is_advised(evofsm):
-    rows = (f"{k // 2},{('level', 'flow')[k % 2]},{k % 7}" for k in range(200))
-    Path("tags.csv").write_text("\n".join(["time,tag,value", *rows]))
+@pytest.mark.parametrize("names", ["time,tag,value", "time,entity_id,state", "time,tag,x,quality"])
+def test_a_row_of_each_signal_becomes_a_column_as_it_is_advised(evofsm, names):
+    more, fan = ",192" * ("quality" in names), "value" in names
+    rows = [f"{k // 2},{('level', 'flow')[k % 2]},{k % 7}{more}" for k in range(200)]
+    rows += [f"{k},fan,on" for k in range(100, 110) if fan]
+    Path("tags.csv").write_text("\n".join([names, *rows]))
     command, again = evofsm("learn", "tags.csv").stdout.splitlines()[-2:]
     shell(command.strip())
     assert "--observe level,flow" in evofsm(*again.split()[1:]).stdout
+
+
+def test_a_first_look_says_what_it_cannot_tell(evofsm):
+    header, rows = "at,heat,at 2,oil,event,oil", []
+    for k in range(200):
+        event = "LOW" if k % 40 == 39 else ""
+        rows.append(f"{at(k):%Y-%m-%d %H:%M},{k % 7},{at(2 * k):%Y-%m-%d %H:%M},{k},{event},1")
+    Path("log.csv").write_text("\n".join([header, *rows]))
+    looked = " ".join(evofsm("learn", "log.csv").stdout.split())
+    assert "a clock, too? at 2; its columns are read at times of at" in looked
+    assert "two columns are called oil; each needs its own name" in looked
+    assert "a failure? event==LOW (5 times" in looked
+    end, *more = "***End_of_Header***", "Date\t2025/03/03\t", "X_Value\tlevel\tComment"
+    rows = (f"{k / 10}\t{k % 17}\t" for k in range(200))
+    Path("log.lvm").write_text("\n".join([end, "Samples\t9\t", more[0], end, more[1], *rows]))
+    assert "--time X_Value" in evofsm("learn", "log.lvm").stdout
 
 
 def test_signals_of_two_clocks_are_held_as_it_is_proposed(evofsm):

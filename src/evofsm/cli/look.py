@@ -55,7 +55,10 @@ _FAILURE = re.compile(
     re.IGNORECASE,
 )
 _TRUTH = re.compile("true|false|yes|no|ja|nein|wahr|falsch|", re.IGNORECASE)
-_TAG = re.compile("(^|_)tag|signal|sensor|variable|channel|kanal|param|messstelle|name", re.I)
+_TAG = re.compile(
+    "(^|_)tag|signal|sensor|variable|channel|kanal|param|messstelle|name|entity|metric|_point",
+    re.IGNORECASE,
+)
 _WHO = re.compile("ma(sch|ch)ine|device|ger(ä|ae)t|asset|unit|anlage|pump|motor|(^|_)id$", re.I)
 _CODE = re.compile(f"{_FAILURE.pattern}|stat|zustand|code", re.IGNORECASE)
 _LONG = "20ms 50ms 100ms 200ms 500ms 1s 2s 5s 10s 20s 30s 1min 2min 5min 10min 30min 1h 5h 10h 1d"
@@ -72,7 +75,8 @@ def show_look(files: Sequence[str], table: CsvTable | ParquetTable) -> None:
     if not (options or before):
         texts = (explained(table.first(n)) for n in table.columns if table.holds(n) == "text")
         why = next((f": {text}" for text in texts if "thousands" in text), "")
-        raise ValueError(f"{file} has no column of numbers that change{why}")
+        other = " other" * ("two columns" in dict(contents))
+        raise ValueError(f"{file} has no{other} column of numbers that change{why}")
     to_file = "--guard" if any(name == "--failed" for name, _ in options) else "--out"
     options += [(to_file, f"{to_file[2:]}.evofsm")] if options else []
     print("\nA way to learn from it:")
@@ -108,8 +112,11 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     runs = values[still] > limit if still else runs
     rare = [*_rare(frame, [name for name in (*texts, *values) if name not in USUAL_EPISODE])]
     likely = [row for row in rare if _FAILURE.search(row[1])]
-    truths = {name for name in texts if all(map(_TRUTH.fullmatch, frame[name].unique()))}
-    rare = likely or [row for row in rare if row[0] in {*values, *truths}]
+    kinds = {name: frame[name].unique().to_list() for name in texts}
+    truths = {name for name in texts if all(map(_TRUTH.fullmatch, kinds[name]))}
+    remarks = {name for name in texts if len({*kinds[name]} - {*tables.MISSING}) == 1}
+    marks = [row for row in rare if row[0] in {*values, *truths}]
+    rare = likely or marks or [row for row in rare if row[0] in remarks and len(row[-1]) > 1]
     markers = {name for name, *_ in rare}  # which do not tell episodes apart
     groups = [name for name in (*USUAL_EPISODE, *texts, *values) if name in frame.columns]
     groups = [name for name in groups if name not in markers and not _FAILURE.search(name)]
@@ -130,6 +137,8 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     facts = [*columns.items()][:_COLUMNS_SHOWN]
     if more := len(columns) - len(facts):
         facts.append(("...", f"and {more:,} more columns"))
+    if twice := dict.fromkeys(n for n in table.columns if n and table.columns.count(n) > 1):
+        facts.append(("two columns", f"are called {', '.join(twice)}; each needs its own name"))
     n_partial = int(np.isnan([runs, *values.values()]).any(0).sum())
     facts += [("incomplete", f"{n_partial:,} rows, in which a number is missing")] * (n_partial > 0)
     facts += [("bad fields", f"{n:,} {text}") for text, n in odd.items()]
@@ -161,9 +170,13 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     if still:
         options.append(("--where", f"{_named(still, _SIGNS)}>{limit:g}"))
         facts.append(("stands still", f"in {1.0 - runs.mean():.1%} of rows, by {still}"))
-    if clock and group in texts and _TAG.search(group) and len(values) == 1:
-        facts.append(("a row?", f"of each {group} its own: make columns of them, and look again"))
-        pivot = f"{group!r}, index={clock.split(',')}, values={[*values]}"
+    tags = [name for name in texts if _TAG.search(name) and group in ("", name)]
+    tag = next((name for name in tags if group or _takes_turns(frame[name])), "")
+    many = [name for name, z in values.items() if len(np.unique(z[np.isfinite(z)])) > 1]
+    many = [name for name in many if "qual" not in name.lower()]
+    if clock and tag and len(many) == 1:
+        facts.append(("a row?", f"of each {tag} its own: make columns of them, and look again"))
+        pivot = f"{tag!r}, index={clock.split(',')}, values={many}"
         return facts, [], f".pivot({pivot}, aggregate_function='last')"
     facts += [("a failure?", f"{text} {frequency}") for _, text, frequency, _ in rare]
     untold = "no column tells of one; docs/logs.md makes one of times, or of the last rows of runs"
@@ -211,6 +224,9 @@ def _first_rows(
     table.skips.kinds.clear()  # said where all rows are read
     clocks = (name for name, dates in early.items() if dates.n_unique() > 1)  # no date of an export
     clock, form = next(clocks, "") or next(together, ""), ""
+    for name in date_columns:
+        if clock in early and early[name].n_unique() > 1 and not early[name].equals(early[clock]):
+            asides.append(("a clock, too?", f"{name}; its columns are read at times of {clock}"))
     dates = clock.split(",") if clock else []
     numbers = [name for name in firsts if table.holds(name) == "number"]
     texts = [name for name in firsts if name not in {*numbers, *date_columns, *dates}]
@@ -346,7 +362,7 @@ def _episodes(frame: polars.DataFrame, clock: str, names: Sequence[str]) -> tupl
             places = _numbered(frame[name])
             order = np.argsort(places, kind="stable")
             n_within = int(_odd(np.diff(at[order])[np.diff(places[order]) == 0]).sum())
-            takes_turns = _WHO.search(name) and 2 * (np.diff(places) != 0).sum() > len(at)
+            takes_turns = _WHO.search(name) and _takes_turns(frame[name])
             if 10 * n_within < (len(at) if takes_turns else n_odd - _MANY):
                 return name, order
     return "", rows[::-1] if 2 * (np.diff(at) < 0.0).sum() > len(rows) else rows
@@ -448,6 +464,11 @@ def _rare(frame: polars.DataFrame, columns: Sequence[str]) -> Iterator[tuple[str
 def _numbered(values: polars.Series) -> Floats:
     """Of each row which of the different values it has, as a number."""
     return values.rank("dense").fill_null(0).cast(polars.Float64).to_numpy()
+
+
+def _takes_turns(values: polars.Series) -> bool:
+    """Whether some values change from row to row in most."""
+    return values.n_unique() <= len(values) / 10 and 2 * len(values.rle()) > len(values)
 
 
 def _is_in_blocks(values: polars.Series) -> bool:

@@ -81,6 +81,7 @@ _NO_TABLE = {
     rb"\w[^\s,=]*(,[^\s,=]+=[^\s,]+)* [^\s,=]+=[^,\n]+(,[^\s,=]+=[^,\n]+)*( \d{10,})?\n": "is line "
     "protocol of InfluxDB; write it as CSV, with a column for each field",
 }
+_LABVIEW = "***End_of_Header***"  # what stands above its table, twice
 _PROFILE = len(_MCAP) + 1 + 8 + 4  # of MCAP, behind the mark, an opcode and two lengths
 
 #: Factors that turn units of time into s, and all units into s, m, m/s or m/s².
@@ -578,6 +579,8 @@ class CsvTable(Table):
             return scores.index(max(scores))
         rows = [at for at, line in enumerate(lines) if line.strip() and not _COMMENT.match(line)]
         rows = [at for at in rows if not lines[at].startswith("sep=")]
+        ends = [place for place, at in enumerate(rows, 1) if lines[at].startswith(_LABVIEW)]
+        rows = rows[ends[-1] :] if ends else rows
         counts = [sum(map(bool, headers[at])) for at in rows], [len(headers[at]) for at in rows]
         usual, size = (max(n, key=n.count, default=0) for n in counts)
 
