@@ -36,9 +36,7 @@ _NEAR = 3  # rows before a failure that are never proposed to be left out
 _ODD, _MANY, _MANY_BAD = 0.001, 10, 0.05
 _NAME = "(time|zeit|timestamp|sec|epoch|x_value)([^a-z]|$)"  # the last is LabVIEW's
 _TIME = re.compile(rf"ts?([\W_]*[mun]?s|[\W_]+(min|h|d))?\W*$|{_NAME}", re.IGNORECASE)
-_CLOCK = re.compile(
-    "times?|timestamps?|stamps?|ticks?|sec(ond)?s?|epoch|elapsed|zeit(stempel)?", re.IGNORECASE
-)
+_CLOCK = re.compile("times?|(time)?stamps?|ticks?|sec(ond)?s?|epoch|elapsed|zeit(stempel)?", re.I)
 _FRAME = re.compile("frame([^a-z]|$)", re.IGNORECASE)  # it counts steps of the same length
 # Other dates: the year first, or the day or the month, which may be a name.
 _OTHER = re.compile(r"(\d+)([/ -])(\w+)\2(\d{2,4})(,? )\d\d?:\d\d(:\d\d(\.\d+)?)?( [AP]M)?$", re.I)
@@ -55,10 +53,7 @@ _FAILURE = re.compile(
     re.IGNORECASE,
 )
 _TRUTH = re.compile("true|false|yes|no|ja|nein|wahr|falsch|", re.IGNORECASE)
-_TAG = re.compile(
-    "(^|_)tag|signal|sensor|variable|channel|kanal|param|messstelle|name|entity|metric|_point",
-    re.IGNORECASE,
-)
+_TAG = re.compile("(^|_)tag|signal|sensor|variab|channel|kanal|param|messst|name|entity", re.I)
 _WHO = re.compile("ma(sch|ch)ine|device|ger(ä|ae)t|asset|unit|anlage|pump|motor|(^|_)id$", re.I)
 _CODE = re.compile(f"{_FAILURE.pattern}|stat|zustand|code", re.IGNORECASE)
 _LONG = "20ms 50ms 100ms 200ms 500ms 1s 2s 5s 10s 20s 30s 1min 2min 5min 10min 30min 1h 5h 10h 1d"
@@ -172,8 +167,7 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
         facts.append(("stands still", f"in {1.0 - runs.mean():.1%} of rows, by {still}"))
     tags = [name for name in texts if _TAG.search(name) and group in ("", name)]
     tag = next((name for name in tags if group or _takes_turns(frame[name])), "")
-    many = [name for name, z in values.items() if len(np.unique(z[np.isfinite(z)])) > 1]
-    many = [name for name in many if "qual" not in name.lower()]
+    many = [n for n, z in values.items() if len(np.unique(z)) > 1 and "qual" not in n.lower()]
     if clock and tag and len(many) == 1:
         facts.append(("a row?", f"of each {tag} its own: make columns of them, and look again"))
         pivot = f"{tag!r}, index={clock.split(',')}, values={many}"
@@ -216,10 +210,8 @@ def _first_rows(
     firsts = {name: table.first(name).strip() for name in table.columns if table.holds(name)}
     pairs = [*zip(firsts, [*firsts][1:], strict=False)]
     date_columns = [name for name, text in firsts.items() if is_date(text)]
-    alone = (pair for pair in pairs if pair[0] not in date_columns)
-    together = (
-        f"{a},{b}" for a, b in alone if ":" in firsts[b] and is_date(f"{firsts[a]} {firsts[b]}")
-    )
+    alone = ((a, b) for a, b in pairs if a not in date_columns and ":" in firsts[b])
+    together = (f"{a},{b}" for a, b in alone if is_date(f"{firsts[a]} {firsts[b]}"))
     early = next(table.pieces(Wanted([], date_columns))).texts if date_columns else {}
     table.skips.kinds.clear()  # said where all rows are read
     clocks = (name for name, dates in early.items() if dates.n_unique() > 1)  # no date of an export
@@ -307,8 +299,8 @@ def _dates(
     frame: polars.DataFrame, names: Sequence[str], asides: Pairs
 ) -> tuple[polars.DataFrame, str, str] | None:
     """Rows with dates as `_forms` has them, in one column or two; None of others."""
-    texts, is_text = frame[names[0]], frame[names[0]].dtype == polars.String
-    texts = texts if is_text else texts.cast(polars.Int64, strict=False)
+    texts = frame[names[0]]
+    texts = texts.cast(polars.Int64, strict=False) if texts.dtype.is_numeric() else texts
     texts = texts.cast(polars.String)
     for name in names[1:]:
         texts = texts + " " + frame[name]
@@ -319,7 +311,7 @@ def _dates(
         at = texts.str.to_datetime(form.replace(".%f", "%.f"), strict=False).dt.epoch("us")
         read[form] = at.null_count(), int(_odd(np.diff(at.drop_nulls())).sum()), at
     form = min(read, key=lambda form: read[form][:2])
-    if 2 * read[form][0] * (1 if is_text else len(texts)) > len(texts):  # numbers are all dates
+    if 2 * read[form][0] > len(texts):
         return None
     if len({faults[:2] for faults in read.values()}) < len(read):
         text = f"day or month first cannot be told of {texts[0]}; it is read as {form} (--unit)"
@@ -434,7 +426,7 @@ def _is_set(name: str) -> bool:
 def _stands(z: Floats) -> bool:
     """Whether numbers are near 0 for a while, and else far from it."""
     z = z[np.isfinite(z)]
-    if np.mean(np.diff(z) > 0.0) > _RISING:  # a count of ticks, which may begin anew
+    if (np.diff(z) > 0.0).sum() > _RISING * len(z):  # a count of ticks, which may begin anew
         return False
     size = np.abs(z)
     low, mid = (float(np.mean(size < x * np.quantile(size, 0.95))) for x in (0.05, 0.5))

@@ -911,8 +911,7 @@ def _microseconds(
                 dates = texts.str.to_datetime(form + parts, strict=False)
         except polars.exceptions.ComputeError:  # it knows no form from the first one
             dates = polars.Series(name, [None] * len(texts), polars.Datetime("us"))
-        if ends.any():
-            dates += ends.cast(polars.Int64) * timedelta(days=1)
+        dates += ends.cast(polars.Int64) * timedelta(days=1)
     if dates.null_count():
         piece.leave_out(name, dates.is_null().to_numpy(), f"{why}{_SAYS_HOW}")
     return dates.dt.epoch("us").cast(polars.Float64).to_numpy()
