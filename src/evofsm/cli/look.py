@@ -70,8 +70,8 @@ def show_look(files: Sequence[str], table: CsvTable | ParquetTable) -> None:
     if not (options or before):
         texts = (explained(table.first(n)) for n in table.columns if table.holds(n) == "text")
         why = next((f": {text}" for text in texts if "thousands" in text), "")
-        other = " other" * ("two columns" in dict(contents))
-        raise ValueError(f"{file} has no{other} column of numbers that change{why}")
+        kind = "other column" if "two columns" in dict(contents) else "column"
+        raise ValueError(f"{file} has no {kind} of numbers that change{why}")
     to_file = "--guard" if any(name == "--failed" for name, _ in options) else "--out"
     options += [(to_file, f"{to_file[2:]}.evofsm")] if options else []
     print("\nA way to learn from it:")
