@@ -184,7 +184,7 @@ def test_learn_writes_a_guard_that_the_monitor_takes(evofsm, own, tmp_path, judg
     assert ("decision" in live, "error" in live) == (True, False)
     watched = watched_log(str(own), reading_of(**read_with(path)[0]), guard=Guard.load(path))
     assert watched.system.of_cars == (judge == "kinematic")
-    assert "failures  3; 3 in alarm by then, for " in summed.stdout
+    assert "failures   3; 3 in alarm by then, for " in summed.stdout
     assert answer["alarm"]
     assert answer["mode"] == "shadow"
     assert answer["evidence"] > 0

@@ -170,6 +170,27 @@ def numbers_of(text):
     return [one for one in cells if one and one[0].replace(".", "").isdecimal()]
 
 
+def test_a_summary_takes_no_unknown_risk_for_0_and_no_alarm_for_one_of_another_episode(tmp_path):
+    file, rows = tmp_path / "rows.jsonl", [{"time": float(k), "x": 1.0} for k in range(10)]
+    file.write_text("".join(json.dumps({**row, "proposal": 0.0}) + "\n" for row in rows))
+    zero = "--observe", "x", "--low", -1, "--high", 1, "--interval", 1, "--failed", "x>9"
+    said = evofsm(file, "--summary", *zero).stdout
+    assert "not known  its risk 100.00% of the time\n" in said
+    assert "By risk" not in said
+    apart = {"time": 9.5, "gap": None, "v_follower": 20.0, "v_leader": None, "proposal": 0.0}
+    ends = [b'{"end": true}', line(apart), b'{"end": true, "failed": true}']
+    ego = {"x": 0.0, "lane": 1, "vx": 20.0, "length": 4.6}
+    free = [{"time": 10.0 + k / 10, "proposal": 0, "ego": ego, "objects": []} for k in range(10)]
+    file.write_bytes(b"\n".join([*map(line, closing_in(90)), *ends, *map(line, free)]))
+    said = evofsm(file, "--summary").stdout
+    assert "alarms     1, or " in said
+    assert "failures   1; 0 in alarm by then\n" in said
+    assert "not known  its risk 10.00% of the time, or nobody was ahead\n" in said
+    _, count, hourly, _ = numbers_of(said)[0]
+    assert "By risk of what was proposed,\nwhile it is known" in said
+    assert float(hourly) == 3600.0 / 9.0 * int(count) > 0.0
+
+
 def test_a_summary_says_that_rows_come_too_seldom(tmp_path):
     file = tmp_path / "rows.jsonl"
     file.write_bytes(b"".join(line(row) + b"\n" for row in closing_in(9, dt=1.0)))
@@ -222,14 +243,14 @@ def test_a_summary_says_how_often_it_alarms_and_is_risky_and_where_it_is_worst(t
         share = f"{sum(map(sum, on)) / decided:.2%}"
         return f"{begun:,}", f"{begun * 36000.0 / decided:,.1f}", share
 
-    assert f"alarms  {'{}, or {} an hour, {}'.format(*counted(alarms))}" in result.stdout
+    assert f"alarms     {'{}, or {} an hour, {}'.format(*counted(alarms))}" in result.stdout
     for least, *told in by_risk:
         assert tuple(told) == counted([[risk > float(least) for risk in trip] for trip in risks])
     assert 0 < len(worst) <= 10
     assert worst[0][-2] == f"{max(map(max, risks)):.1%}"
     by_lines = evofsm(lines, *made)
-    assert "refused   1 messages, the first because line 1: is no JSON" in by_lines.stdout
-    assert "failures  2; 1 in alarm by then, for " in by_lines.stdout
+    assert "refused    1 message, the first because line 1: is no JSON" in by_lines.stdout
+    assert "failures   2; 1 in alarm by then, for " in by_lines.stdout
     assert [one[1] for one in numbers_of(by_lines.stdout)[:6]] == [one[1] for one in by_risk]
 
 

@@ -15,6 +15,7 @@ from evofsm.cli.monitor.decider import HOLE, Answer, Decider
 from evofsm.cli.monitor.messages import End, Row
 from evofsm.cli.show import facts, table
 from evofsm.fsm.naming import visible
+from evofsm.fsm.validation import counted
 from evofsm.guard.audit_log import lines
 from evofsm.guard.foresight import span
 from evofsm.io.logs import Chunk
@@ -116,14 +117,16 @@ def decided_on_lines(decider: Decider, file: Path) -> Answers:
 def summary_of(decider: Decider, answers: Answers, title: str) -> Iterator[RenderableType]:
     """Tables of what was decided; a ValueError if nothing was."""
     rows: list[Row] = []
-    numbers, errors, failed = [], [], []
+    numbers, errors, failed, is_new = [], [], [], True
     for answer, row in answers:
         if answer["kind"] == "decision" and row is not None:
             rows.append(row)
-            risk, begins = answer["risk_proposed"] or 0.0, decider.rows == 1 or len(rows) == 1
-            numbers.append((row.time, risk, answer["alarm"], begins))
-        elif answer["kind"] == "end" and answer["failed"] and rows:
-            failed.append(len(rows) - 1)
+            begins = decider.rows == 1 or len(rows) == 1
+            numbers.append((row.time, answer["risk_proposed"], answer["alarm"], begins))
+            is_new = False
+        elif answer["kind"] == "end":
+            failed += [-1 if is_new else len(rows) - 1] * answer["failed"]
+            is_new = True
         elif answer["kind"] == "error":
             errors.append(_refusal(answer))
     if not rows:
@@ -133,53 +136,65 @@ def summary_of(decider: Decider, answers: Answers, title: str) -> Iterator[Rende
     follows = (begins == 0.0) & (steps > 0.0) & (steps <= HOLE * interval)
     durations = np.where(follows, steps, interval)
 
-    def counted(above: NDArray[np.bool_]) -> tuple[str, str, str]:
+    def tally(above: NDArray[np.bool_], seconds: float) -> tuple[str, str, str]:
         count = (above & ~(np.roll(above, 1) & (begins == 0.0))).sum()
-        hourly = count * 3600.0 / durations.sum()
-        return f"{count:,}", f"{hourly:,.1f}", f"{above @ durations / durations.sum():.2%}"
+        hourly = count * 3600.0 / seconds
+        return f"{count:,}", f"{hourly:,.1f}", f"{above @ durations / seconds:.2%}"
 
-    count, hourly, share = counted(alarms > 0.0)
+    seconds, is_known = durations.sum(), ~np.isnan(risks)
+    count, hourly, share = tally(alarms > 0.0, seconds)
     usual = np.sort(steps)[(len(steps) - 1) // 2]
-    text = f"{len(rows):,} in {begins.sum():,.0f} episodes, {durations.sum() / 3600.0:.3g} h"
+    text = f"{len(rows):,} in {counted(int(begins.sum()), 'episode')}, {seconds / 3600.0:.3g} h"
     if usual > HOLE * interval:
         text += f"; they come every {span(usual)}, and count as {interval:g} s each (--interval)"
-    pairs = [("rows", text), ("alarms", f"{count}, or {hourly} an hour, {share} of the time")]
-    if useless := refusing(alarms @ durations / durations.sum()):
+    pairs = [("decisions", text), ("alarms", f"{count}, or {hourly} an hour, {share} of the time")]
+    if useless := refusing(alarms @ durations / seconds):
         pairs.append(("beware", f"it {useless}"))
+    if not is_known.all():
+        text = f"its risk {tally(~is_known, seconds)[-1]} of the time"
+        text += ", or nobody was ahead" * any(row.observation is None for row in rows)
+        pairs.append(("not known", text))
     # A moment lasts while an alarm does; the highest risk within it stands for it.
     calm = (alarms == 0.0) & (np.diff(times // _MOMENT, prepend=0.0) != 0.0)
     first = (begins > 0.0) | calm | (np.diff(alarms, prepend=0.0) != 0.0)
     moments = np.cumsum(first)
     long = np.bincount(moments, durations * alarms)[moments]
     if failed:
-        before = long[failed]
+        before = np.append(long, 0.0)[failed]  # where nothing was decided there was no alarm
         text = f"{len(failed):,}; {(before > 0.0).sum():,} in alarm by then"
         ahead = f", for {np.median(before[before > 0.0]):.1f} s (median)" if before.any() else ""
         pairs.append(("failures", text + ahead))
     if errors:
-        pairs.append(("refused", f"{len(errors):,} messages, the first because {errors[0]}"))
+        pairs.append(
+            ("refused", f"{counted(len(errors), 'message')}, the first because {errors[0]}")
+        )
     yield facts(title, pairs)
     tolerance = getattr(decider.guard.reviser, "tolerance", None)
     tolerances = sorted({*_TOLERANCES, *([] if tolerance is None else [tolerance])})
-    risk_rows = [(f"{risk:g}", *counted(risks > risk)) for risk in tolerances]
+    rest = max(durations @ is_known, interval)
+    risk_rows = [(f"{risk:g}", *tally(risks > risk, rest)) for risk in tolerances]
     bold = [place for place, risk in enumerate(tolerances) if risk == tolerance]
     # Whether it would alarm with another tolerance, one pass does not say.
     header = ("above", "times", "an hour", "of the time")
-    yield table("\nBy risk of what was proposed", header, risk_rows, bold=bold)
+    if is_known.any():
+        title = "\nBy risk of what was proposed" + ", while it is known" * (not is_known.all())
+        yield table(title, header, risk_rows, bold=bold)
+    heights = np.nan_to_num(risks)
     parts = np.split(np.arange(len(rows)), np.flatnonzero(first)[1:])
-    highest = [int(part[risks[part].argmax()]) for part in parts]
+    highest = [int(part[heights[part].argmax()]) for part in parts]
     names = decider.form.variables or [f"{k + 1}" for k in range(len(rows[0].observation or ()))]
     names = () if decider.form.scenes else names[:_MOST_VARIABLES]
     episodes, worst = np.cumsum(begins), []
-    for at in sorted(highest, key=lambda at: (-risks[at], -long[at]))[:_WORST]:
-        if risks[at] or alarms[at]:
+    for at in sorted(highest, key=lambda at: (-heights[at], -long[at]))[:_WORST]:
+        if heights[at] or alarms[at]:
             cells = [*(rows[at].observation or ())[: len(names)], rows[at].proposal]
             texts = [
                 f"{v:.4g}" if isinstance(v, float) else str("" if v is None else v) for v in cells
             ]
             where = (f"{episodes[at]:.0f}", f"{times[at]:.10g}", *texts)
             star = "*" * bool(alarms[at] and risks[at] <= (tolerance or 0.0))
-            worst.append((*where, f"{risks[at]:.1%}{star}", f"{long[at]:.1f}"))
+            text = f"{risks[at]:.1%}{star}" if is_known[at] else "not known"
+            worst.append((*where, text, f"{long[at]:.1f}"))
     header = ("episode", "time", *names, "proposed", "risk", "alarm lasts [s]")
-    why = " (*: alarmed for a margin, or its risk is not known)" * any("*" in x[-2] for x in worst)
+    why = " (*: alarmed for a margin)" * any("*" in x[-2] for x in worst)
     yield table(f"\nThe worst moments{why}", header, worst)
