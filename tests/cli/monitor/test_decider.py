@@ -311,6 +311,24 @@ def test_a_reviser_without_risks_alarms_where_it_differs():
     assert (answer["alarm"], answer["mode"], answer["risk_proposed"]) == (True, "act", None)
 
 
+def test_what_nothing_averts_by_the_model_alone_alarms_also_where_an_episode_begins_with_it():
+    guard = Guard(low=-1.0, high=1.0, interval=0.1, horizon=1.0, mode=Mode.SHADOW)
+    for _ in range(3):
+        place = speed = 0.0
+        while place < 1.0:
+            guard.decide([place, speed], 1.0)
+            place, speed = place + 0.1 * speed, speed + 0.1
+        guard.end(failed=True, observation=[place, speed])
+    decider, guard.learn = Decider(guard), False
+    for place, speed, alarms in ((0.5, 40.0, True), (-0.5, 0.0, False)):
+        told = {"time": decider.n, "observation": [place, speed], "proposal": -1.0}
+        answer = decider.answer(line(told))
+        assert (answer["alarm"], answer["advised"]) == (alarms, -1.0)
+        assert answer["risk_proposed"] is None
+        assert ("no backup prevents failure" in answer["reason"]) == alarms
+        decider.answer(b'{"end": true}')
+
+
 def test_in_traffic_who_came_across_the_lane_and_stands_there_is_still_there():
     decider = Decider(guard_of_monitor(0.1, 6.0, traffic=True))
     answer = in_scenes(decider, x=0.0, y=0.0, vx=15.0, length=5.0)

@@ -443,15 +443,15 @@ class Decider:
             return call()
 
     def _is_alarm(self, revision: Revision) -> bool:
-        """Whether the proposal is not kept, or too risky; as it was while that is not known.
+        """Whether the proposal is not kept, or too risky; refused, or as it was, if not known.
 
         Cars brake in proportion: an alarm begins where a proposal is not kept, but for a little,
         and lasts until its risk is tolerable.
         """
         reviser: Any = self.guard.reviser
         if not self._drives:
-            is_unknown = self.rows > 1 and math.isnan(revision.risk_proposed)
-            return is_spoken(reviser, revision) or (is_unknown and self._alarm)
+            stays = getattr(reviser, "refuses", False) or (self.rows > 1 and self._alarm)
+            return is_spoken(reviser, revision) or (math.isnan(revision.risk_proposed) and stays)
         if self.rows > 1 and self._alarm:
             return bool(reviser.refuses or revision.risk_proposed > reviser.tolerance)
         wish = make_usable(Proposal(revision.proposed), reviser.actions, reviser.fallback).action
