@@ -121,11 +121,13 @@ def test_commands_are_distributions_and_stand_for_what_was_tried(model, least):
     first, commands, labels = parsed(to_prism(model, evidence=2.0, least=least))
     assert first == 1 + np.argmin(model.created)
     share = model.failures / np.maximum(model.decisions, 1e-300)
+    ends = np.clip(model.visits - model.decisions.sum(axis=0), 0.0, model.endings)
     for (state, action), row in commands.items():
         assert row.sum() == pytest.approx(1.0, abs=1e-14)
         if action[1:].isdigit():
             a, s = int(action[1:]) - 1, state - 1
-            moves = model.transition_matrices[a, s]
+            moves = model.transition_matrices[a, s] * (1.0 - ends / model.visits)
+            moves /= moves.sum()
             moves = np.where(moves >= min(least, moves.max()), moves, 0.0)
             moves *= (1.0 - share[a, s]) / moves.sum()
             assert row == pytest.approx([share[a, s], *moves], abs=1e-11)
@@ -134,6 +136,16 @@ def test_commands_are_distributions_and_stand_for_what_was_tried(model, least):
     assert (labels["failed"], labels["state_2"]) == ("s=0", "s=2")
     for state in range(model.n_states + 1):  # PRISM refuses a state without a command
         assert any(s == state for s, _ in commands)
+
+
+def test_a_failure_is_no_move_to_the_state_in_which_it_was_seen_as_well():
+    machine = EvolvingFSM(1, rule=Novelty(radius=1.0))
+    for _ in range(20):
+        machine.learn_many([[0.0], [10.0]] * 2 + [[20.0]], [0] * 5, [0], failures=[4])
+    first, commands, labels = parsed(to_prism(machine.model()))
+    assert commands[first + 1, "a1"] == pytest.approx([0.5, 0.5, 0.0, 0.0], abs=0.02)
+    assert commands[first + 1, "a1"][3] == 0.0
+    assert (commands[3, "failed"][0], labels["unknown"]) == (1.0, "false")
 
 
 @pytest.mark.parametrize("least", [0.0, 0.01])

@@ -117,7 +117,8 @@ def to_prism(model: FSMModel, evidence: float = 1.0, least: float = 0.0) -> str:
     """The model as a Markov decision process in the language of PRISM, which Storm reads as well.
 
     In state ``s=i``, which people call #i, every action that was tried there is a command. It ends
-    in failure, ``s=0``, as often as the action failed in this state, and else moves as was learnt.
+    in failure, ``s=0``, as often as the action failed in this state, and else moves as was learnt
+    of what came without failing. A state in which each episode was seen to fail leads to ``s=0``.
 
     Parameters
     ----------
@@ -152,8 +153,7 @@ def to_prism(model: FSMModel, evidence: float = 1.0, least: float = 0.0) -> str:
     // #1, 3 visits
       [a1] s=1 -> // 3 decisions; a1 was used 3 times
         0.333333333333:(s'=0) + // failed 1
-        0.514194120112:(s'=1) + // seen 2
-        0.152472546555:(s'=2); // seen 1
+        0.666666666667:(s'=1); // seen 2
     """
     n = model.n_states
     _PROBABILITY.refuse_others("least", least)
@@ -165,13 +165,19 @@ def to_prism(model: FSMModel, evidence: float = 1.0, least: float = 0.0) -> str:
     body, unknown = list[str](), list[int]()
     arrivals = model.changes @ model.recognise(model.centers)  # and what is believed beside it
     was_seen = arrivals > _STRAY * model.changes.sum(axis=1, keepdims=True)
+    # Whoever failed as it came is no arrival; where a decision followed, that failed.
+    ends = np.clip(model.visits - model.decisions.sum(axis=0), 0.0, model.endings)
+    going_on = 1.0 - ends / np.maximum(model.visits, 1.0)
+    going_on[going_on < _STRAY] = 0.0
     for state in range(n):
         about = [f"#{state + 1}", *(_where(model, state) if model.names else [])]
         body += ["", f"  // {', '.join([*about, counted(round(model.visits[state]), 'visit')])}"]
         actions = np.flatnonzero(model.decisions[:, state] >= evidence).tolist()
-        where = model, state, was_seen[state]
+        where = model, state, was_seen[state], going_on
         body += [line for action in actions for line in _command(*where, action, least)]
-        if not actions:
+        if not actions and going_on[state] == 0.0:
+            body.append(f"  [failed] s={state + 1} -> 1:(s'=0);")
+        elif not actions:
             unknown.append(state + 1)
             body[-1] += ": no action has the evidence"
             body.append(f"  [unknown] s={state + 1} -> 1:(s'={state + 1});")
@@ -209,16 +215,22 @@ def _header(model: FSMModel, evidence: float, least: float, unknown: int) -> Ite
 
 
 def _command(
-    model: FSMModel, state: int, was_seen: NDArray[np.bool_], action: int, least: float
+    model: FSMModel,
+    state: int,
+    was_seen: NDArray[np.bool_],
+    going_on: NDArray[np.float64],
+    action: int,
+    least: float,
 ) -> Iterator[str]:
     decisions, failures = model.decisions[action, state], model.failures[action, state]
-    row = model.transition_matrices[action, state]
+    row = model.transition_matrices[action, state] * going_on
+    row /= row.sum() or 1.0
     if 0.0 < (support := row[was_seen].sum()) < (most := decisions / (1.0 + decisions)):
         # Where it was not for long, what is new is nearly certain to follow, by the prior alone.
         row = row * np.where(was_seen, most / support, (1.0 - most) / (1.0 - support))
     row = np.where(row >= min(least, row.max()), row, 0.0)
     share = failures / decisions
-    chances = np.concatenate([[share], (1.0 - share) * row / row.sum()])
+    chances = np.concatenate([[share], (1.0 - share) * row / (row.sum() or 1.0)])
     parts: list[int] = np.rint(chances * 10**_DECIMALS).astype(np.int64).tolist()
     parts[int(np.argmax(parts))] += 10**_DECIMALS - sum(parts)  # to the last digit
     comments = [f"failed {failures:.4g}", *(f"seen {count:g}" for count in model.changes[state])]
