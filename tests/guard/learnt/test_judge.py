@@ -188,8 +188,11 @@ def test_what_was_seen_twice_before_a_decision_is_learnt_of_at_once(points):
     for k, proposal in enumerate(np.random.default_rng(0).uniform(-1.0, 1.0, 20)):
         guard.decide([0.02 * k, 0.02], proposal, 0.1 * k)
     guard.recognise([0.4, 0.02], 2.0)
-    reason = guard.revise(guard.recognise([0.42, 0.02], 2.1), Proposal(1.0)).reason
-    assert "no backup prevents failure" in reason
+    one = guard.revise(guard.recognise([0.42, 0.02], 2.1), Proposal(1.0))
+    assert "after the proposal no backup prevents failure" in one.reason
+    assert "how that ends was not seen yet" in one.reason
+    assert one.evidence == 0.0  # though something is remembered
+    assert guard.judge.remembered.number
 
 
 @pytest.mark.parametrize("stride", [1, 2])
@@ -457,7 +460,9 @@ def test_it_says_which_backup_survives_why_a_proposal_is_refused_and_what_fails(
     for one, as_proposed in zip(said, kept(said), strict=True):
         assert bool(survives.fullmatch(one.reason)) == as_proposed
         assert ("no backup " in one.reason) == (not as_proposed)
-        instead = re.search("the closest action after which|no action passes; ", one.reason)
+        instead = re.search(
+            "the closest action after which|no action passes by the margin; ", one.reason
+        )
         assert bool(instead) == (not as_proposed)
 
 

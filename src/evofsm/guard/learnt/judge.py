@@ -361,7 +361,9 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         soon = self._soon(memory.seconds)
         risk, low, high = np.array([self._risk(n, soon) for n in counts]).T
         distances = np.array([outcome.left for outcome in outcomes])
-        return Judgement(risk, low, high, distances, float(memory.number), situation.seen)
+        is_seen = memory.lost[1] > 0 or math.inf not in counts
+        evidence = float(memory.number) if is_seen else 0.0
+        return Judgement(risk, low, high, distances, evidence, situation.seen)
 
     def _soon(self, exposure: float) -> float:
         """The horizon, as a share of the time in which all that is remembered was seen."""

@@ -46,10 +46,11 @@ NOTHING_SEEN = "not each variable was observed yet in this episode"
 #: Said where it is far from all that was seen, or was not seen whole for long.
 BY_MODEL = "by the model alone, so its risk is not known: "
 NO_FAILURE = "no failure is known yet, so nothing is refused"
+_NONE = "no action passes by the margin"
 #: What is done where all backups look alike and another action was hardly used.
-TRIED = "no action passes; what this one does is hardly known, so it is tried"
+TRIED = f"{_NONE}; what this one does is hardly known, so it is tried"
 #: What is done where no backup lasts longer than the proposal.
-NO_LONGER = "no action passes, and no backup lasts longer than the proposal, so that is kept"
+NO_LONGER = f"{_NONE}, and by the model no backup lasts longer than the proposal, so that is kept"
 #: The condition where not all actions are allowed.
 IF_NO_MORE = ", if no more than now is ever allowed"
 #: The same where there is but one action.
@@ -99,9 +100,11 @@ def refused(unsurvived: int, remembered: Remembered, margin: float, scale: float
     """Why an action is dangerous; ``unsurvived`` is -1 without a disturbance, 0 by the margin."""
     if unsurvived < 0:
         n_failed, n = remembered.lost
-        text = "no backup prevents failure, even if nothing disturbs it"
-        text += f"; so it seemed in {counted(n, 'episode')} of late: {n_failed} failed" * (n > 0)
-        return text
+        record = f"so it seemed in {counted(n, 'episode')} of late: {n_failed} failed"
+        record = record if n else "how that ends was not seen yet"
+        return (
+            f"after the proposal no backup prevents failure, even if nothing disturbs it; {record}"
+        )
     if unsurvived == 0:
         text = f"no backup survives {remembered.most} by the margin of {changes(margin)}"
         return text if scale < _HARDER else f"{text}, were they {scale:.2g} times as hard"
@@ -113,7 +116,7 @@ def refused(unsurvived: int, remembered: Remembered, margin: float, scale: float
 def alone(why: str) -> str:
     """Why it is dangerous where there is but one action, and so no backup."""
     why = why.replace("no backup survives", "it does not survive")
-    return why.replace("no backup prevents failure", "it fails")
+    return why.replace("after the proposal no backup prevents failure", "it fails")
 
 
 def dead_ends(counts: Sequence[int]) -> str:
@@ -144,7 +147,7 @@ def lasting(backup: str, *, cut: bool) -> str:
     """What is done instead, where no action passes."""
     if cut:
         return f"the search was cut short, as it took too many steps; {backup} passed last"
-    return f"no action passes; {backup} lasts longest"
+    return f"{_NONE}; by the model {backup} lasts longest"
 
 
 def no_threshold(n_failed: int, n_seen: int, n_survived: int, *, is_given: bool) -> str:
