@@ -248,6 +248,7 @@ def test_failures_are_told_with_what_they_rest_on():
     assert str(FailureRecord(0, 9.0)) == "0 failures in 9 h: at most 0.34 per hour, 95 %, one-sided"
     text = str(FailureRecord(1, 0.0, 0.0, 1))
     assert text == "1 failure in 1 episode, 0 h, 0 km: nothing is known"
+    assert str(FailureRecord(1, 0.00419, 0.2)).startswith("1 failure in 0.0041 h, 0.2 km: 240 per")
     text = str(FailureRecord(2, 120.7, 9000.0, 500))
     assert text.startswith("2 failures in 500 episodes, 120 h, 9,000 km: 0.017 per hour (0.0029 to")
     assert text.endswith("0.22 per 1,000 km (0.039 to 0.70), 90 %, two-sided")

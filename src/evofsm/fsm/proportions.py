@@ -135,7 +135,8 @@ class FailureRecord(NamedTuple):
             (self.kilometres, "km", 1000.0, "per 1,000 km"),
         ):
             if exposure is not None:
-                few = f"{outward(math.floor, exposure, 2):g}"
+                small = min(max(exposure, 1e-9), 0.1)  # has two digits
+                few = f"{outward(math.floor, exposure, 1 - math.floor(math.log10(small))):g}"
                 many = f"{math.floor(exposure + 1e-6):,}"
                 exposures.append(f"{few if exposure < 10.0 else many} {unit}")
             if exposure:

@@ -253,4 +253,8 @@ def test_where_there_is_no_rival_nothing_is_doubted():
                 break
         guard.end(failed=place >= 1.0, observation=[place])
     assert guard.judge.state.n_doubted > guard.judge.settings.patience
-    assert "tries whether" not in str(guard)
+    assert "it only fails" not in str(guard)
+    forms = np.repeat(guard.judge.state.forms, 2, axis=0)  # of rivals all count the same failures
+    guard.judge.state = guard.judge.state._replace(forms=forms, n_doubted=-1)
+    (only,) = re.findall("it only fails ([^;]*)", str(guard))
+    assert re.fullmatch(r"where variable 1 is above [\d.]+", only)

@@ -62,7 +62,8 @@ _FARTHEST = 1_000_000
 _HARDER = 1.05
 # Of more dead ends, those from where most failed are counted.
 _ENDS_SHOWN = 3
-# What was seen in a form, by what it says.
+# How often something was seen in a form, and what that is by what the form says.
+_NOTE = r" \([\d,]+ (?:failure|ending)s?\)"
 _WHAT = {FAILS: "failure", CRASHES: "failure", ENDS: "ending", FATAL: "time"}
 
 
@@ -188,10 +189,10 @@ def experience(
         more += "decides"
     if state.is_doubted and (learning or state.is_settled):  # frozen, others count for nothing
         fails, exits, _ = _where(state.rivals, names)
-        # What only rivals take for endings were failures.
-        exits = [t if t in ends else re.sub(r"ending(s?\))$", r"failure\1", t) for t in exits]
+        only = f"{fails}{', and ends by itself ' * bool(exits)}{' or '.join(exits)}"
         more += f"; {'tried while it learns, ' * learning}as much was refused without a failure: it"
-        more += f" only fails {fails}{', and ends by itself ' * bool(exits)}{' or '.join(exits)}"
+        # They take the same failures, so that no count is one's own.
+        more += f" only fails {re.sub(_NOTE, '', only)}"
     if len(state.dropped):
         until, *_ = _where(state.dropped, names)
         more += f"; frozen it refuses, too, {until}, as what took its place is new"
@@ -215,7 +216,9 @@ def _where(table: Floats, names: Sequence[str]) -> tuple[str, list[str], list[st
             sides.append(text.removeprefix("where ").removesuffix(f" ({counted(count, kind)})"))
         else:
             places[int(row[SAYS])].append(text)
-    there = [" or ".join([f"where {' or '.join(sides)}"] * bool(sides) + places[FAILS])]
+    places = {says: [*dict.fromkeys(texts)] for says, texts in places.items()}
+    beyond = " or ".join(dict.fromkeys(sides))
+    there = [" or ".join([f"where {beyond}"] * bool(sides) + places[FAILS])]
     there += [f"if it ends {' or '.join(places[CRASHES])}"] * bool(places[CRASHES])
     return ", or ".join(filter(None, there)), places[ENDS], places[FATAL]
 
