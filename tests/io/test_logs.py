@@ -320,7 +320,8 @@ def test_bad_rows_are_left_out_and_counted_up_to_a_number(tmp_path, pieces, bad,
     kept = [7, 1, 2, 3, *([] if starts == [0, 4] else [4]), 5, 6, 7]
     assert together(path, noted=noted, failed="crash") == (kept, starts, [])
     (warning,) = warnings_of(noted, LogColumns())
-    assert f"{len(bad)} bad rows were left out (--skip-bad), the first: {path}, " in warning
+    rows = "1 bad row was" if len(bad) == 1 else f"{len(bad)} bad rows were"
+    assert f"{rows} left out (--skip-bad), the first: {path}, " in warning
     assert said in warning
     assert said in refusal(path, failed="crash")
     path = write(tmp_path / "b.csv", [*good[:4], *bad * 11], SHORT)
@@ -342,15 +343,16 @@ def test_a_failure_at_a_time_that_is_there_twice_is_one(tmp_path):
     assert together(path, failed="crash") == ([3, 2, 1, 9], [0, 3], [2])
 
 
-def test_a_missing_action_is_counted_where_another_row_follows(tmp_path, pieces):
+@pytest.mark.parametrize(("runs", "says"), [("pq", "2 rows have"), ("p", "1 row has")])
+def test_a_missing_action_is_counted_where_another_row_follows(tmp_path, pieces, runs, says):
     lines = [
-        f"{p},{k / 10:.1f},{k},10,11,{'' if k in (2, 3) else 1},0" for p in "pq" for k in range(4)
+        f"{p},{k / 10:.1f},{k},10,11,{'' if k in (2, 3) else 1},0" for p in runs for k in range(4)
     ]
     chunks = read(write(tmp_path / "a.csv", lines, SHORT), noted=(noted := Noted()))
     actions = np.concatenate([chunk.actions for chunk in chunks])
-    assert np.isnan(actions).tolist() == [False, False, True, True] * 2
+    assert np.isnan(actions).tolist() == [False, False, True, True] * len(runs)
     (warning,) = warnings_of(noted)
-    assert "2 rows have no action" in warning
+    assert f"{says} no action" in warning
     assert "line 4, column 'a_follower'" in warning
 
 

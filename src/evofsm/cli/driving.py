@@ -30,6 +30,7 @@ from evofsm.driving.sumo import open_world
 from evofsm.driving.trials import Row
 from evofsm.driving.world import World
 from evofsm.extras import needs
+from evofsm.fsm.validation import counted
 from evofsm.guard import TOLERANCE, AuditLog, DecisionLogger, Guard, Mode
 
 #: The columns of ``decisions.parquet`` after ``episode``; `driving/naming.py` says which they are.
@@ -296,7 +297,7 @@ def told_of(row: Row, results: Results) -> Iterator[tuple[str, str]]:
     """Collisions and their price, and what was learnt."""
     setup = results.setup
     kind = "training" if setup.learn else "held-out"
-    yield "family", f"{row.family}, {row.episodes:,} {kind} episodes"
+    yield "family", f"{row.family}, {counted(row.episodes, f'{kind} episode')}"
     yield "reviser", f"{setup.reviser}, {setup.mode.value}"
     yield "judge", f"{setup.judge}, given {TOLD[setup.judge]}"
     interval = f"(95 %, two-sided: {row.collision_low:.1%} to {row.collision_high:.1%})"

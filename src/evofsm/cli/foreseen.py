@@ -281,7 +281,7 @@ def _headline(document: dict[str, Any]) -> str:
     """What came of the alarm, in a line."""
     rows = [row for row in document["alarms"] if row["is_own"]]
     if not rows:
-        return f"{document['failures']:,} failures, no alarm"
+        return f"{counted(document['failures'], 'failure')}, no alarm"
     tally = rows[0]["learnt"]
     rates = f"{tally['false_a_day']:.2g} false a day ({rows[0]['stated']:g} stated)"
     ahead = f"{tally['foreseen']} of {tally['failures']} failures foreseen, {span(tally['lead'])}"

@@ -43,12 +43,14 @@ _SHORTER = ("ms", "us", "ns")
 _MATCHES = 0.02  # so near must a unit come to what two columns differ by, to be named
 # What is said of what was left out, where it is no row.
 _LEFT_OUT = {
-    "comment": "comments between rows were passed over",
-    "action": "rows have no action, and what leads on from them was not learnt",
-    "stand-in": "numbers of the action are far from all others, and were read as missing",
+    "comment": "comment{s} between rows {were} passed over",
+    "action": "row{s} {have} no action, and what leads on from there was not learnt",
+    "stand-in": "number{s} of the action {are} far from all others, and {were} read as missing",
     "cut": "file ends early, and what is whole was read",
-    "letter": "lines have letters of another encoding than most, read as '\ufffd'",
+    "letter": "line{s} {have} letters of another encoding than most, read as '\ufffd'",
 }
+_ONE = {"s": "", "were": "was", "have": "has", "are": "is"}
+_SEVERAL = {word: word for word in _ONE}
 _NO_SPEED = 500.0  # no car's speed in any unit [m/s]: revolutions, perhaps
 #: Columns of more different numbers are no choice among some; and the most intervals for those.
 MOST_LEVELS, _MOST_INTERVALS = 12, 50
@@ -169,14 +171,17 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
     if alone := [(name, *pair) for name, pair in noted.below.items() if pair[0] and pair[1] > 2]:
         name, value, rows = min(alone, key=lambda entry: entry[1] not in _NOBODY)
         hint = f"is that {missing(f'{name}=={value!r}')}"
-        warnings.append(f"{name} is {value!r} in {rows:,} rows, apart from all others: {hint}")
+        warnings.append(
+            f"{name} is {value!r} in {counted(rows, 'row')}, apart from all others: {hint}"
+        )
     warnings += _contradictions(noted, columns)
     if noted.unplaced:
         lie = "failure lies" if noted.unplaced == 1 else "failures lie"
         why = "in rows that are left out, outside of any episode: not counted"
         warnings.append(f"{noted.unplaced:,} {lie} {why}")
     for kind, (count, first) in noted.skipped.items():
-        text = _LEFT_OUT.get(kind, "bad rows were left out (--skip-bad)")
+        text = _LEFT_OUT.get(kind, "bad row{s} {were} left out (--skip-bad)")
+        text = text.format_map(_ONE if count == 1 else _SEVERAL)
         warnings.append(f"{count:,} {text}, the first: {first}")
     return [*warnings, *noted.told]
 
@@ -478,10 +483,10 @@ def read_otherwise(
         nobody = columns.no_leader not in (None, "end")
         why = "a number is missing" + f", or {columns.no_leader}" * nobody
         ends = "" if hole and not columns.no_leader else "; there an episode ends"
-        yield "left out", f"{noted.leaderless:,} rows: {why}{ends}"
+        yield "left out", f"{counted(noted.leaderless, 'row')}: {why}{ends}"
     if noted.elsewhere:
         why = f"--where {columns.where} does not hold; there an episode ends"
-        yield "left out", f"{noted.elsewhere:,} rows: {why}"
+        yield "left out", f"{counted(noted.elsewhere, 'row')}: {why}"
     units = (f"{name} from {u}" for name, u in noted.units.items() if UNITS.get(u, 1.0) != 1.0)
     if text := ", ".join(units):
         yield "converted", f"{text} to units of the SI"
