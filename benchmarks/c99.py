@@ -461,14 +461,15 @@ def _learnt(guard: Guard, code: dict[str, int], number: dict[str, float]) -> str
 def _kinematic(guard: Guard, code: dict[str, int], number: dict[str, float]) -> str:
     reviser: Any = guard.reviser
     trial = reviser.risk.trial()
+    is_estimated = math.isnan(number["risk_proposed"])
+    doubt = "by an estimate alone, so its risk is not known" * is_estimated
     if code["reason"] == 0:
-        return "risk is within the tolerance"
+        return doubt or "risk is within the tolerance"
+    doubt += ": " * is_estimated
     if code["reason"] == 6:
-        return f"{trial.unknown}: {trial.doing}"
-    why = (
-        f"could not survive a leader braking harder than {number['left']:.1f} m/s² "
-        f"(risk {number['risk_proposed']:.1%})"
-    )
+        return f"{doubt}{trial.unknown}: {trial.doing}"
+    why = f"{doubt}could not survive a leader braking harder than {number['left']:.1f} m/s²"
+    why += "" if is_estimated else f" (risk {number['risk_proposed']:.1%})"
     if trial is not None:
         why += f"; {trial.unknown}, {f'so {trial.how}' if reviser.acts else trial.assumed}"
     return why if code["reason"] == 5 else f"{why}; {_CHOSEN[code['reason']]}"

@@ -66,9 +66,13 @@ def test_the_less_is_seen_the_more_careful_it_gets():
         assert watch.situation.intake is (Intake.WHOLE if k < 4 else Intake.PARTIAL)
         risks.append(revision.risk_proposed)
     assert risks[4] < 0.02
-    assert risks[-1] > 0.5
+    assert np.isnan(risks).tolist() == [False] * 8 + [True] * 16  # from the fifth on
+    assert (np.isnan(revision.interval).all(), revision.evidence) == (True, 0.0)
     assert revision.executed < 0.0
-    assert "not seen: gap, v_leader" in revision.reason
+    unseen, why, _ = revision.reason.split("; ")
+    assert unseen == "not seen: gap, v_leader"
+    assert why.startswith("by an estimate alone, so its risk is not known: could not survive")
+    assert "(risk" not in why
     blind = guard().decide([NAN, 10.0, 10.0], 1.0)  # from the start
     assert (blind.risk_proposed, blind.executed) == (1.0, -4.0)
 
@@ -161,7 +165,7 @@ def test_a_clock_that_goes_back_is_followed_and_one_that_stands_still_sees_nothi
         assert not math.isnan(revision.risk_proposed)
     else:
         assert all(one.intake is Intake.PARTIAL and np.isnan(one.observation).all() for one in then)
-        assert math.isnan(revision.risk_proposed) == (kind == "learnt")
+        assert math.isnan(revision.risk_proposed)
         assert twin.recognise(usual, others[-1] + 2 * dt).intake is Intake.GAP
 
 

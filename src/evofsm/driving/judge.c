@@ -6,6 +6,7 @@
   double mean[3], spread[3][3];          /* where one most likely was, and how sure that is */
   double here[3], around[3][3];          /* the same now */
   int is_located;                        /* whether that is known */
+  int n_blind;                           /* observations on end that lack something */
   int revising, tries;
   double options[EVOFSM_OPTIONS], risk[EVOFSM_OPTIONS], critical[EVOFSM_OPTIONS];
 /* ==== source ==== */
@@ -286,7 +287,7 @@ static int decide_by_risk(evofsm_state *s, const double here[3], int *reason) {
 
 static void forget(evofsm_state *s) {
   s->before = s->commanded = 0.0;
-  s->is_located = 0;
+  s->is_located = s->n_blind = 0;
 }
 
 /* What to execute of s->proposal, into s->best, and how risky that is. */
@@ -318,9 +319,14 @@ static void revise(evofsm_state *s, evofsm_decision *out) {
   if (is_whole(here)) {
     bounds(s->risk[best], &out->risk_low, &out->risk_high);
   }
+  if (s->n_blind + 1 >= BLIND && !is_whole(s->observation)) {
+    out->risk_proposed = out->risk_executed = out->risk_low = out->risk_high = NAN;
+    out->evidence = 0.0;
+  }
 }
 
 static void follow(evofsm_state *s, const double executed[EVOFSM_ACTIONS]) {
+  s->n_blind = is_whole(s->observation) ? 0 : s->n_blind + 1;
   if (is_whole(s->here)) {
     s->is_located = 1;
     memcpy(s->mean, s->here, sizeof s->mean);

@@ -38,7 +38,7 @@ from evofsm.fsm.sharing import Retraced, step
 from evofsm.fsm.validation import Floats, positive, real_array, refuse_unusable, usable_array
 from evofsm.guard import TOLERANCE, Judgement, Situation
 from evofsm.guard.actions import ActionSet, BoxActions, nearest_bounds
-from evofsm.guard.api import LearningJudge, Trial
+from evofsm.guard.api import LearningJudge, Trial, is_missing
 from evofsm.store import COUNT, SIZE, SMALLEST, Kind, Numbers, Place
 
 if TYPE_CHECKING:
@@ -54,6 +54,8 @@ SLIGHT = 0.1
 STANDS = 0.1
 # Where a situation is not sure, it may be worse by so many standard deviations.
 _CAUTION = 2.5
+# From so many observations on end that lack something on, an estimate is not known (`LearntRisk`).
+_BLIND = 5
 # Nearly no gap [m]: smaller than any that counts as no collision for who moves.
 _ALMOST = 1e-9
 
@@ -245,11 +247,14 @@ class LatentRisk(Retraced, LearningJudge):
         """Latent risk of each acceleration that could be commanded now [m/s²].
 
         What was not seen (NaN) is estimated from what was seen before; the less sure that is, the
-        higher the risk. Where nothing was seen before either, every risk is 1.
+        higher the risk. Where nothing was seen before either, every risk is 1. From the fifth
+        observation on end that lacks something, such a risk decides, but is not known.
         """
         here = self._cautious(situation.observation)
         actions = usable_array("accelerations", accelerations)
         table, evidence = self.manoeuvres.table, float(len(self.manoeuvres))
+        if self.perception.unseen + 1 >= _BLIND and is_missing(situation.observation):
+            evidence = math.nan
         if not is_whole(here):  # where one is cannot be told: nothing can be survived for sure
             sure = np.ones(len(actions))
             return Judgement(sure, 0.0 * sure, sure, 0.0 * sure, evidence, situation.seen)
@@ -261,7 +266,8 @@ class LatentRisk(Retraced, LearningJudge):
     def why(self, judged: Judgement) -> str:
         """Why the first action that was judged is dangerous, in a few words."""
         decel, risk = float(judged.critical[0]), float(judged.risk[0])
-        return f"could not survive a leader braking harder than {decel:.1f} m/s² (risk {risk:.1%})"
+        text = f"could not survive a leader braking harder than {decel:.1f} m/s²"
+        return text if math.isnan(judged.evidence) else f"{text} (risk {risk:.1%})"
 
     def trial(self) -> Trial | None:
         """Full braking, until it is known what it brings."""
@@ -383,7 +389,7 @@ class LatentRisk(Retraced, LearningJudge):
             "ALMOST": _ALMOST,
             "DOUBT": perception._OWN if self.brakes.known else perception._OWN_UNKNOWN,
             **{"ANOTHER": perception._ANOTHER_LEADER, "EXACT": not any(self.perception.noise)},
-            **{"EVIDENCE": float(len(self.manoeuvres)), "ONCOMING": ONCOMING},
+            **{"EVIDENCE": float(len(self.manoeuvres)), "ONCOMING": ONCOMING, "BLIND": _BLIND},
             **{"TABLE": self.manoeuvres.table.shape[1], "harder": self.manoeuvres.table},
             **{"noise": self.perception.noise, "option_low": lowest, "option_high": highest},
         }

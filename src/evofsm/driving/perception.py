@@ -78,6 +78,8 @@ class Perception:
         """An episode begins: nothing is known of where one is; the noise is that of before."""
         #: At the observation before.
         self.latest: Estimate | None = None
+        #: Observations on end, up to that one, that lack something.
+        self.unseen = 0
         self._seen: Three | None = None
         self._changes = nan, nan  # of both speeds, beyond what was expected
 
@@ -92,7 +94,9 @@ class Perception:
         estimate = self.estimate(now, realised, sure=sure)
         if not is_whole(now):
             self._seen, self._changes = None, (nan, nan)
+            self.unseen += 1
         else:
+            self.unseen = 0
             if learn and self._seen is not None:
                 self._learn(self._seen, now, realised)
             self._seen = now

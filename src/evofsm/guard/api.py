@@ -119,7 +119,7 @@ class Judgement(NamedTuple):
     low: Floats  #: (k,)
     high: Floats  #: (k,)
     critical: Floats  #: (k,) hardest disturbance that is survived, in its own unit
-    evidence: float  #: number of disturbances it rests on
+    evidence: float  #: number of disturbances it rests on; NaN: the risks decide, but are not known
     seen: float = math.nan  #: time spent in states like this one [s]; NaN where that is not known
 
 

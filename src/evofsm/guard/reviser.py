@@ -57,6 +57,7 @@ _CLIPPED, _CLEARLY = 100, 10.0
 # States that were seen for a shorter time are new [s].
 _NEW = 0.5
 _KEPT = "risk is within the tolerance"
+_ESTIMATED = "by an estimate alone, so its risk is not known"
 #: Done without a usable proposal where nobody says what is better.
 NOTHING = Fallback(0.0, "doing nothing")
 
@@ -226,6 +227,10 @@ class ActionReviser:
             revision = unjudged_revision(original, proposal, remark or "reviser is off")
             return revision._replace(advised=fixed(action))
         options, judgement, best, reason = self._search(situation, action, acts, proposal.mask)
+        if math.isnan(judgement.evidence):
+            nans = np.full(len(options), math.nan)
+            judgement = judgement._replace(risk=nans, low=nans, high=nans, evidence=0.0)
+            reason = _ESTIMATED if reason == _KEPT else f"{_ESTIMATED}: {reason}"
         index, advice = best if acts else 0, fixed(options[best])
         if not acts and best != 0:
             reason = f"{self.passing or self.mode.value}: {reason}"

@@ -101,6 +101,23 @@ def test_in_words_it_is_said_where_the_risk_is_not_known():
     assert lacks[:2] == [b"9  note: no trip in the row\n", b""]
 
 
+@pytest.mark.parametrize(("gap", "alarm"), [(30.0, False), (5.0, True)])
+def test_of_cars_the_risk_is_not_known_where_the_gap_was_seen_long_ago(gap, alarm):
+    row, seen = {"v_follower": 20.0, "v_leader": 20.0, "proposal": 0.0}, [*range(3), 90]
+    gaps = [{"time": k / 10, "gap": gap if k in seen else None} for k in range(91)]
+    answers, text = answers_to([line({**one, **row}) for one in gaps], learn=False), Text()
+    assert {answer["alarm"] for answer in answers} == {alarm}
+    names = ("risk_proposed", "risk_executed", "risk_low", "risk_high")
+    unknown = [[one[name] is None for name in names] for one in answers]
+    assert unknown == [[7 <= k < 90] * 4 for k in range(91)]
+    assert (answers[6]["evidence"] > 9.0, answers[7]["evidence"]) == (True, 0.0)
+    said = b"".join(map(text.line, answers)).decode().splitlines()
+    blind, last = said[-2:]
+    assert blind.startswith("0.7  not seen: gap; ")
+    assert "by an estimate alone, so its risk is not known" in blind
+    assert last.startswith("9  the risk is known again")
+
+
 def test_in_words_it_is_said_where_an_alarm_goes_blind_and_what_stands():
     usual = {"kind": "decision", "risk_proposed": 0.9, "alarm": True, "reason": "heat 9: above 7"}
     blind = {**usual, "reason": "not seen: heat; the alarm stays on"}

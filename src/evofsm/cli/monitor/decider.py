@@ -453,7 +453,7 @@ class Decider:
             stays = getattr(reviser, "refuses", False) or (self.rows > 1 and self._alarm)
             return is_spoken(reviser, revision) or (math.isnan(revision.risk_proposed) and stays)
         if self.rows > 1 and self._alarm:
-            return bool(reviser.refuses or revision.risk_proposed > reviser.tolerance)
+            return not (revision.risk_proposed <= reviser.tolerance and not reviser.refuses)
         wish = make_usable(Proposal(revision.proposed), reviser.actions, reviser.fallback).action
         change = abs(float(revision.advised) - float(wish))
         return bool(reviser.refuses and not 0.0 < change <= SLIGHT)
