@@ -28,6 +28,7 @@ CONFIGURATION = """<configuration>
     <collision.action value="warn"/>
     <no-warnings value="true"/>
     <end value="80"/>
+    <remote-port value="8813"/><num-clients value="2"/>
 </configuration>"""
 
 

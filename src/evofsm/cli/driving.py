@@ -425,7 +425,9 @@ def _running(file: Path, *options: str) -> Iterator[tuple[Any, Iterator[float]]]
     with needs("libsumo", "sumo", "a SUMO configuration"):
         sumo: Any = import_module("libsumo")
     try:
-        sumo.start(["sumo", "-c", str(file), "--no-step-log", "true", *options])
+        # With a port it would wait for a client, for ever.
+        mute = "--no-step-log", "true", "--remote-port", "0"
+        sumo.start(["sumo", "-c", str(file), *mute, *options])
     except sumo.TraCIException as error:
         raise ValueError(f"{file}: SUMO refuses it: {str(error).strip()}") from error
 
