@@ -179,14 +179,17 @@ def along_a_road(turned, along, across):
     return along * c - across * s, along * s + across * c
 
 
+def in_degrees(x, y):
+    return 13.0 + x / 111_195.0 / math.cos(math.radians(52.0)), 52.0 + y / 111_195.0
+
+
 @pytest.mark.parametrize("told", [("posLat",), ("x", "y", "angle"), ("x", "y", "angle", "geo")])
 @pytest.mark.parametrize("ending", ["xml", "csv"])
 def test_who_is_beside_is_nobody_s_leader_in_fcd(tmp_path, told, ending):
     seen = []
     for name, (along, across) in ACROSS.items():
         x, y = along_a_road(math.radians(60.0), along, across)
-        if "geo" in told:
-            x, y = 13.0 + x / 111_195.0 / math.cos(math.radians(52.0)), 52.0 + y / 111_195.0
+        x, y = in_degrees(x, y) if "geo" in told else (x, y)
         places = {"posLat": across, "x": x, "y": y, "angle": 30.0, "geo": 1}
         kind = "truck" if name == "truck" else "bike"
         seen.append((name, "e", along, 5.0, kind, *(places[place] for place in told)))
@@ -205,13 +208,14 @@ def test_who_is_beside_is_nobody_s_leader_in_fcd(tmp_path, told, ending):
     assert "is it narrower than 2.5 m? --vehicle-length bike=12x0.8" in " ".join(warnings_of(noted))
 
 
-@pytest.mark.parametrize("told", [(), ("posLat",)])
+@pytest.mark.parametrize("told", [(), ("posLat",), ("geo",)])
 @pytest.mark.parametrize("speed", [0.5, 0.0])
 def test_who_parks_beside_the_road_is_nobody_s_leader_until_it_is_back(tmp_path, told, speed):
     road = {}
     for k, y in enumerate([0.0, 3.2, 3.2, 3.2, 3.2, 0.0, 0.0]):
-        x, v = 10.0 + 20 * k, 0.0 if k else speed
-        road[k] = ("van", "e", 100.0, v, 100.0, y, 0.0), ("car", "e", x, 20.0, x, 0.0, 0.0)
+        x, v, places = 10.0 + 20 * k, 0.0 if k else speed, [(10.0 + 20 * k, 0.0), (100.0, y)]
+        here, beside = (in_degrees(*place) if told == ("geo",) else place for place in places)
+        road[k] = ("car", "e", x, 20.0, *here, 0.0), ("van", "e", 100.0, v, *beside, 0.0)
     found = episodes(write(tmp_path / "a.xml", xml(road, (*FIELDS[:4], "x", "y", *told))))
     if not speed:  # where the road is, nobody knows
         assert found[-1][2][-1] == 6.0

@@ -84,6 +84,7 @@ class PairTable(Table):
     moments: Iterable[Moment]
     skips: Skips
     lengths: VehicleLengths | None = None  #: of FCD
+    in_degrees: bool = field(default=False, init=False)  #: as somebody drove on a lane and showed
 
     columns = COLUMNS
     derives = True
@@ -164,7 +165,11 @@ class PairTable(Table):
             if car.heading != car.heading:
                 car = car._replace(heading=heading)
             drives = not car.speed < _TURNS_ABOVE
-            aside = abs(car.place - place) - 2.0 * abs(car.along - along)
+            apart, way = car.place - place, abs(car.along - along)
+            if car.lanes == ways and way > 0.1 and _is_in_degrees(apart, way):
+                self.in_degrees = True
+            apart = _metres(apart, car) if self.in_degrees else apart
+            aside = abs(apart) - 2.0 * way
             parks = not drives and car.lanes == ways and aside > _USUAL_WIDTH
             # Who was never seen to drive on a lane may have been beside it from the first.
             is_known = drives or (car.lanes == ways and not parks)
@@ -190,9 +195,7 @@ class PairTable(Table):
                 aside = abs(leader.lateral - car.lateral)
                 if aside != aside and along < _BESIDE_WITHIN:  # across the way, as both point
                     apart = leader.place - car.place
-                    if abs(apart) < 0.01 * along:  # in degrees (--fcd-output.geo)
-                        east = apart.real * math.cos(math.radians(car.place.imag))
-                        apart = complex(east, apart.imag) * _DEGREE
+                    apart = _metres(apart, car) if _is_in_degrees(apart, along) else apart
                     aside = abs((apart * headings.conjugate()).imag)
                     aside /= abs(headings) + 1e-9
                 is_oncoming = abs(headings) < 1.0
@@ -202,6 +205,15 @@ class PairTable(Table):
                         self.lengths.overlaps[leader.kind] += 1
                     yield (car.name, leader.name), (gap, car.speed, leader.speed)
                     break
+
+
+def _is_in_degrees(apart: complex, along: float) -> bool:
+    """Whether places so far apart are (--fcd-output.geo), as they lie on a lane so many metres."""
+    return abs(apart) < 0.01 * along
+
+
+def _metres(apart: complex, near: Vehicle) -> complex:
+    return complex(apart.real * math.cos(math.radians(near.place.imag)), apart.imag) * _DEGREE
 
 
 def _is_on_lane(told: Mapping[str, Any]) -> bool:
