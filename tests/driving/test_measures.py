@@ -85,6 +85,13 @@ def test_who_comes_towards_one_needs_as_much_room_as_oneself():
 
 
 @EVERY_MEASURE
+def test_who_rolls_backwards_and_away_needs_no_way_ahead(measure):
+    away = np.array([[0.65, -4.8, -1.0]])
+    assert measure.score(away, DT) <= 0.0
+    assert not is_dead_end(away, 6.0, 6.0)
+
+
+@EVERY_MEASURE
 @pytest.mark.parametrize("wrong", [-1.0, 0.0, float("nan"), float("inf"), "1"])
 def test_wrong_arguments_are_named(measure, wrong):
     for field in fields(measure):

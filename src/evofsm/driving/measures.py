@@ -43,9 +43,9 @@ def _time_to_cover(gap: Floats, speed: Floats) -> Floats:
     return np.where(gap <= 0.0, 0.0, time)
 
 
-def _way_to_stop(leader_speed: Floats, decel: float) -> Floats:
-    """[m]; negative of a leader that comes towards oneself."""
-    return leader_speed * np.abs(leader_speed) / (2.0 * decel)
+def _way_to_stop(speed: Floats, decel: float) -> Floats:
+    """[m]; negative of who drives backwards, as a leader that comes towards oneself."""
+    return speed * np.abs(speed) / (2.0 * decel)
 
 
 def _unsafe_once_met(gap: Floats, score: Floats) -> Floats:
@@ -229,7 +229,7 @@ class ResponsibilitySensitiveSafety(_Measure):
 
     def _stopping_distance(self, speed: Floats) -> Floats:
         fastest = speed + self.response * self.accel
-        return (speed + fastest) / 2.0 * self.response + fastest**2 / (2.0 * self.decel)
+        return (speed + fastest) / 2.0 * self.response + _way_to_stop(fastest, self.decel)
 
 
 @dataclass(frozen=True)
@@ -319,8 +319,8 @@ class FuzzySafety(_Measure):
         """
         gap, speed, leader_speed = _columns(observations)
         common_distance = speed * self.reaction - _way_to_stop(leader_speed, self.leader_decel)
-        unsafe = common_distance + speed**2 / (2.0 * self.decel)
-        safe = common_distance + speed**2 / (2.0 * self.comfortable_decel) + self.margin
+        unsafe = common_distance + _way_to_stop(speed, self.decel)
+        safe = common_distance + _way_to_stop(speed, self.comfortable_decel) + self.margin
         return np.where(gap <= 0.0, 1.0, _membership(gap - self.margin, unsafe, safe))
 
     def critical(self, observations: Floats, dt: float) -> Floats:
@@ -364,7 +364,8 @@ FIXED_MEASURES: Mapping[str, RiskMeasure] = {
 def is_dead_end(observations: Floats, decel: float, leader_decel: float) -> NDArray[np.bool_]:
     """Whether the cars collide if both brake in full from now until standstill.
 
-    Only a simulation knows both limits. It scores what was learnt; nothing learns from it.
+    Only a simulation knows both limits. It scores what was learnt; nothing learns from it. False
+    where a number is NaN.
 
     Parameters
     ----------
@@ -379,7 +380,7 @@ def is_dead_end(observations: Floats, decel: float, leader_decel: float) -> NDAr
     array([False,  True])
     """
     gap, speed, leader_speed = _columns(observations)
-    final_gap = gap + _way_to_stop(leader_speed, leader_decel) - speed**2 / (2 * decel)
+    final_gap = gap + _way_to_stop(leader_speed, leader_decel) - _way_to_stop(speed, decel)
     smallest = np.minimum(gap, final_gap)
     # A follower who brakes harder is nearest when the speeds meet, if both still move then.
     if decel > leader_decel:
