@@ -35,7 +35,14 @@ from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.proportions import wilson_bounds
 from evofsm.fsm.sharing import Retraced, step
-from evofsm.fsm.validation import Floats, positive, real_array, refuse_unusable, usable_array
+from evofsm.fsm.validation import (
+    Floats,
+    counted,
+    positive,
+    real_array,
+    refuse_unusable,
+    usable_array,
+)
 from evofsm.guard import TOLERANCE, Judgement, Situation
 from evofsm.guard.actions import ActionSet, BoxActions, nearest_bounds
 from evofsm.guard.api import LearningJudge, Trial, is_missing
@@ -238,10 +245,10 @@ class LatentRisk(Retraced, LearningJudge):
     def told_by_experience(self) -> str:
         """What was learnt so far, in words."""
         brakes = f"{self.brakes.decel:.1f} m/s²" if self.brakes.known else "not known yet"
-        return (
-            f"{len(self.manoeuvres)} manoeuvres of leaders, given or seen, 1 % brake harder than "
-            f"{self.manoeuvres.exceeded_by(0.01):.1f} m/s²; own brakes: {brakes}"
-        )
+        decels = self.manoeuvres.decels
+        hardest = f", the hardest by {max(decels):.1f} m/s²" if decels else ""
+        text = f"{counted(len(decels), 'manoeuvre')} of leaders, given or seen{hardest}"
+        return f"{text}, and one assumed, by {self.leader_decel:.1f} m/s²; own brakes: {brakes}"
 
     def judge(self, situation: Situation, accelerations: ArrayLike) -> Judgement:
         """Latent risk of each acceleration that could be commanded now [m/s²].
