@@ -354,7 +354,8 @@ class LatentRisk(Retraced, LearningJudge):
     def critical(self, observation: ArrayLike, accelerations: ArrayLike) -> Floats:
         """(k,) ndarray: hardest braking of the leader, from now on, that is survived [m/s²].
 
-        0 where even a leader who keeps its speed is hit, `rehearsal.HARDEST` where none is.
+        With ``margin`` left. 0 where even a leader who keeps its speed is hit, `rehearsal.HARDEST`
+        where none is.
         """
         triple, actions = _three_finite(observation), usable_array("accelerations", accelerations)
         critical = np.empty(len(actions))
