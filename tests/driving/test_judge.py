@@ -137,7 +137,9 @@ def test_risk_lies_in_its_interval_and_grows_with_the_acceleration(gap, speed, l
     assert ((judged.low >= 0.0) & (judged.low <= judged.risk + 1e-12)).all()
     assert ((judged.high <= 1.0) & (judged.high >= judged.risk - 1e-12)).all()
     assert judged.evidence == 4
-    said = "of leaders, given or seen, the hardest by 4.5 m/s², and one assumed, by 10.0 "
+    said = (
+        "manoeuvres of leaders: 4 given or seen, the hardest by 4.5 m/s², and one assumed, by 10.0 "
+    )
     assert said in risk.told_by_experience
 
 

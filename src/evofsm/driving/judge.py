@@ -35,14 +35,7 @@ from evofsm.fsm.machine import EvolvingFSM
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.proportions import wilson_bounds
 from evofsm.fsm.sharing import Retraced, step
-from evofsm.fsm.validation import (
-    Floats,
-    counted,
-    positive,
-    real_array,
-    refuse_unusable,
-    usable_array,
-)
+from evofsm.fsm.validation import Floats, positive, real_array, refuse_unusable, usable_array
 from evofsm.guard import TOLERANCE, Judgement, Situation
 from evofsm.guard.actions import ActionSet, BoxActions, nearest_bounds
 from evofsm.guard.api import LearningJudge, Trial, is_missing
@@ -247,7 +240,7 @@ class LatentRisk(Retraced, LearningJudge):
         brakes = f"{self.brakes.decel:.1f} m/s²" if self.brakes.known else "not known yet"
         decels = self.manoeuvres.decels
         hardest = f", the hardest by {max(decels):.1f} m/s²" if decels else ""
-        text = f"{counted(len(decels), 'manoeuvre')} of leaders, given or seen{hardest}"
+        text = f"manoeuvres of leaders: {len(decels)} given or seen{hardest}"
         return f"{text}, and one assumed, by {self.leader_decel:.1f} m/s²; own brakes: {brakes}"
 
     def judge(self, situation: Situation, accelerations: ArrayLike) -> Judgement:

@@ -226,7 +226,7 @@ class Guard:
     Guard of actions from -2.5 to 2.5, each 0.25 s
     judge: LatentRisk (ActionReviser, tolerance 0.02, mode act)
     episodes: 1, failures: 0, states: 1, frozen: no
-    failure: 0 manoeuvres of leaders, given or seen, and one assumed, by 10.0 m/s²; own brakes: not
+    failure: manoeuvres of leaders: 0 given or seen, and one assumed, by 10.0 m/s²; own brakes: not
     known yet
     """
 

@@ -166,7 +166,7 @@ class PairTable(Table):
                 car = car._replace(heading=heading)
             drives = not car.speed < _TURNS_ABOVE
             apart, way = car.place - place, abs(car.along - along)
-            if car.lanes == ways and way > 0.1 and _is_in_degrees(apart, way):
+            if car.lanes == ways and 0.1 < way > 100.0 * abs(apart):
                 self.in_degrees = True
             apart = _metres(apart, car) if self.in_degrees else apart
             aside = abs(apart) - 2.0 * way
@@ -195,7 +195,7 @@ class PairTable(Table):
                 aside = abs(leader.lateral - car.lateral)
                 if aside != aside and along < _BESIDE_WITHIN:  # across the way, as both point
                     apart = leader.place - car.place
-                    apart = _metres(apart, car) if _is_in_degrees(apart, along) else apart
+                    apart = _metres(apart, car) if abs(apart) < 0.01 * along else apart
                     aside = abs((apart * headings.conjugate()).imag)
                     aside /= abs(headings) + 1e-9
                 is_oncoming = abs(headings) < 1.0
@@ -207,12 +207,8 @@ class PairTable(Table):
                     break
 
 
-def _is_in_degrees(apart: complex, along: float) -> bool:
-    """Whether places so far apart are (--fcd-output.geo), as they lie on a lane so many metres."""
-    return abs(apart) < 0.01 * along
-
-
 def _metres(apart: complex, near: Vehicle) -> complex:
+    """Of degrees (--fcd-output.geo), which are next to nothing for a way along a lane."""
     return complex(apart.real * math.cos(math.radians(near.place.imag)), apart.imag) * _DEGREE
 
 
