@@ -208,6 +208,22 @@ def test_stops_and_limits_stay_the_drivers(road, parking):
     assert guards.summary()["car_seconds"] == pytest.approx(0.1 * (here - stood))
 
 
+def held(road):
+    """Guards, in a simulation in which ego has just been taken over, as the first car brakes."""
+    guards = attach(sumo := road(*NO_GAP), ["ego"])
+    while sumo.vehicle.getSpeedMode("ego") == 31:
+        drive(sumo, 0.1)
+    return sumo, guards
+
+
+def test_where_a_speed_limit_drops_a_guarded_car_brakes_no_harder_than_it_can(road):
+    sumo, _ = held(road)
+    sumo.edge.setMaxSpeed("road", 4.0)
+    speeds = [sumo.vehicle.getSpeed("ego"), *drive(sumo, 4.0)]
+    assert np.diff(speeds).min() >= -0.9001
+    assert min(speeds) < 4.0
+
+
 REACTS = measures.ResponsibilitySensitiveSafety(0.1, 3.5, 4.5, 9.0)
 ACTIONS = IntervalActions(-9.0, 3.5, 0.3, outside="clip")
 OWN = {
@@ -409,9 +425,7 @@ def test_a_car_that_sumo_teleports_begins_anew(tmp_path):
 
 
 def test_a_car_that_a_script_stops_stays_stopped_until_the_script_lets_it_go(road):
-    guards = attach(sumo := road(*NO_GAP), ["ego"])
-    while sumo.vehicle.getSpeedMode("ego") == 31:
-        drive(sumo, 0.1)
+    sumo, guards = held(road)
     sumo.vehicle.setSpeed("ego", 0.0)
     with pytest.warns(RuntimeWarning, match="a script"):
         speeds = drive(sumo, 15.0, brakes_at=np.inf)

@@ -204,7 +204,9 @@ class Seeing:
     def wish(self, car: str, speed: float, ahead: Neighbour | None) -> float:
         """The speed that a car's own model wants after the next step [m/s], but for red lights."""
         vehicle, body = self._vehicle, self.body(car)
-        fastest = min(vehicle.getAllowedSpeed(car), speed + body.accel * self.dt)
+        # Where a speed limit drops, SUMO's cars brake no harder than by their `decel`.
+        free = max(vehicle.getAllowedSpeed(car), speed - body.decel * self.dt)
+        fastest = min(free, speed + body.accel * self.dt)
         if ahead is None:
             return float(fastest)
         gap = ahead.gap - body.min_gap  # as SUMO's models take it
@@ -392,9 +394,7 @@ class Guarding:
         if revision is None or revision.executed >= car.high:
             self._hand_back(car)
             return
-        next_speed = max(0.0, speed + float(revision.executed) * self._seeing.dt)
-        # Nor faster than it would drive on a free road.
-        car.limit = min(next_speed, self._vehicle.getAllowedSpeed(car.id))
+        car.limit = max(0.0, speed + float(revision.executed) * self._seeing.dt)
         car.wish = self._seeing.wish(car.id, speed, car.around[0])
         most = car.limit + _COARSE * self._seeing.dt
         is_safe = car.wish <= most or self._is_exactly_safe(car, speed)
