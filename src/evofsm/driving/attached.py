@@ -79,7 +79,8 @@ _COARSE = 0.3
 # A speed that differs by no more is the same [m/s].
 _SAME_SPEED = 1e-6
 # SUMO's speed mode where a guard acts: no faster than safe, nor than the car can accelerate (bits 0
-# and 1), but braking as hard as it has to (bit 2). Red lights and right of way stay as they were.
+# and 1), and where a guard asks for more than its `decel` (bit 2 off), SUMO may brake it as hard as
+# it likes, harder than it can. Red lights and right of way stay as they were.
 _ON, _OFF = 0b011, 0b100
 
 
@@ -248,6 +249,7 @@ class _Car:
     guard: Guard
     body: _Facts
     mode: int | None = None  # SUMO's speed mode before it was taken over
+    taken: int = 0  # and since then
     speed: float = 0.0
     limit: float = 0.0  # the speed that was set
     wish: float = 0.0  # the speed that its model wants instead
@@ -402,29 +404,43 @@ class Guarding:
             self._hand_back(car)  # it drives as it would by itself, with its imperfections
             return
         if car.mode is None:
-            car.mode = self._vehicle.getSpeedMode(car.id)
-            self._vehicle.setSpeedMode(car.id, car.mode & ~_OFF | _ON)
+            car.mode = car.taken = self._vehicle.getSpeedMode(car.id)
+        is_hard = car.limit < speed - car.body.decel * self._seeing.dt - _SAME_SPEED
+        self._take(car, (car.mode & ~_OFF if is_hard else car.mode) | _ON)
         self.limited += 1
         self._vehicle.setSpeed(car.id, car.limit)
+
+    def _take(self, car: _Car, mode: int) -> None:
+        if mode != car.taken:
+            self._vehicle.setSpeedMode(car.id, mode)
+            car.taken = mode
 
     def _is_overruled(self, car: _Car, speed: float) -> bool:
         """Whether a script set its speed, which SUMO would forget; then it is left to it."""
         wish = self._vehicle.getSpeedWithoutTraCI(car.id)
         # Under a limit some models (EIDM) drive a little slower than they say.
         limit, slack = (wish, 0.0) if car.mode is None else (car.limit, _COARSE * self._seeing.dt)
+        is_slower = speed < min(limit, wish) - max(slack, _DIFFERS)
         if speed > limit + _DIFFERS:
             car.script = -math.inf
-        elif speed < min(limit, wish) - max(slack, _DIFFERS):
-            if self._vehicle.isStopped(car.id):  # at its stop
-                return False
+        elif is_slower and not self._vehicle.isStopped(car.id):
+            most = car.body.hardest * self._seeing.dt + _DIFFERS
             car.script = speed
+            if car.mode is not None and not car.taken & _OFF and car.speed - speed > most:
+                # So does SUMO itself, as where lanes merge: the next steps say who it was.
+                self._take(car, car.mode | _ON | _OFF)
+                return True
         elif not speed <= car.script + _DIFFERS:
             car.script = math.nan
             return False
+        elif car.mode is not None and speed < car.script - _DIFFERS:
+            car.script = speed  # it brakes on
+            return True
         if not self.overruled:
             warnings.warn(_OVERRULED.format(car.id), RuntimeWarning, stacklevel=5)
         self.overruled += 1
-        self._hand_back(car)
+        if is_slower or speed > limit:  # else the speed that is set may be the guard's own
+            self._hand_back(car)
         return True
 
     def _is_exactly_safe(self, car: _Car, speed: float) -> bool:
@@ -447,7 +463,7 @@ class Guarding:
         if car.mode is not None:
             if math.isnan(car.script):
                 self._vehicle.setSpeed(car.id, -1.0)
-            if self._vehicle.getSpeedMode(car.id) == car.mode & ~_OFF | _ON:  # no script's
+            if self._vehicle.getSpeedMode(car.id) == car.taken:  # no script's
                 self._vehicle.setSpeedMode(car.id, car.mode)
             car.mode = None
 
@@ -824,11 +840,12 @@ def attach(
 
     Notes
     -----
-    Where a guard acts, the speed mode has "safe speed" and the limit of acceleration on and that of
-    braking off. It is put back as it was, with ``setSpeed(-1)``, as soon as the guard allows all
-    that the car can do. A car that is seen to drive at another speed than its guard, or its own
-    driver, had set (a script's) is left alone: a slower one until it drives faster, a faster one
-    while that shows. Where you set a car's speed yourself, ask a `Guard` before you do instead.
+    Where a guard acts, the speed mode has "safe speed" and the limit of acceleration on, and where
+    it brakes harder than ``decel`` that of braking off. It is put back as it was, with
+    ``setSpeed(-1)``, as soon as the guard allows all that the car can do. A car that is seen to
+    drive at another speed than its guard, or its own driver, had set (a script's) is left alone: a
+    slower one until it drives faster, a faster one while that shows. Where you set a car's speed
+    yourself, ask a `Guard` before you do instead.
     After ``load``, or ``close`` and ``start`` of libsumo, an attachment goes on with the new cars,
     and what it counts goes on, as a warning says; ``detach`` ends it, and so does whoever attaches
     anew. With ``--collision.action none``, in any of them, SUMO looks for no collisions, and their
