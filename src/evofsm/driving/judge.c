@@ -5,8 +5,7 @@
   double before, commanded;              /* the latest two commands [m/s²] */
   double mean[3], spread[3][3];          /* where one most likely was, and how sure that is */
   double here[3], around[3][3];          /* the same now */
-  int is_located;                        /* whether that is known */
-  int n_blind;                           /* observations on end that lack something */
+  int is_located, n_blind; /* whether that is known; observations on end that lack something */
   int revising, tries;
   double options[EVOFSM_OPTIONS], risk[EVOFSM_OPTIONS], critical[EVOFSM_OPTIONS];
 /* ==== source ==== */
@@ -293,17 +292,14 @@ static void forget(evofsm_state *s) {
 /* What to execute of s->proposal, into s->best, and how risky that is. */
 static void revise(evofsm_state *s, evofsm_decision *out) {
   const int stands = !ACTS && s->observation[1] < STANDS;
-  double here[3], stay;
+  double here[3];
   int i, best;
   locate(s, s->observation);
   be_cautious(s, here);
   s->tries = ACTS ? s->tries : 0;
   for (i = 0; i < EVOFSM_OPTIONS; i++) {
     s->options[i] = lesser(greater(s->proposal[0], option_low[i]), option_high[i]);
-  }
-  stay = lesser(s->options[0], 0.0);
-  for (i = 0; i < EVOFSM_OPTIONS; i++) {
-    s->options[i] = stands ? greater(s->options[i], stay) : s->options[i];
+    s->options[i] = stands ? greater(s->options[i], lesser(s->options[0], 0.0)) : s->options[i];
     s->critical[i] = is_whole(here) ? critical_of(here, s->options[i], s->commanded) : 0.0;
     s->risk[i] = is_whole(here) ? harder_than(s->critical[i]) : 1.0;
   }

@@ -264,6 +264,7 @@ def _learnt(reviser: ActionReviser) -> Part:
         "JUDGED": min(parts.n_judged, n_queries),
         "MOST_DONE": math.ceil(parts.most),
         "EVIDENCE": float(memory.number),
+        "ENDS_SEEN": int(memory.lost[1] > 0),
         "BLIND": risk.BLIND,
         **{name.strip("_"): getattr(rollout, name) for name in _OF_ROLLOUTS},
         **{name: getattr(model, name) for name in _OF_MODEL},

@@ -26,7 +26,7 @@ from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import Labels, in_a_line
 from evofsm.fsm.rules import reach
 from evofsm.fsm.sharing import Rollback, alone, share, transaction, unshared
-from evofsm.fsm.validation import function, number, positive, real_array, truth, usable_array
+from evofsm.fsm.validation import function, positive, real_array, truth, usable_array
 from evofsm.guard.actions import (
     Action,
     ActionSet,
@@ -35,6 +35,7 @@ from evofsm.guard.actions import (
     checked_mask,
     fixed,
     no_action,
+    proposed,
     put_into,
     same_action,
 )
@@ -544,21 +545,11 @@ class Guard:
                 "RevisedAgents, or give each a guard of its own, such as guard.copy(); then reset"
             )
         action, mask = proposal if isinstance(proposal, Proposal) else (proposal, None)
-        action = no_action(self.actions) if action is None else self._proposed(action)
+        action = no_action(self.actions) if action is None else proposed(self.actions, action)
         mask = checked_mask(self.actions, mask)
         if time is None:
             time = self._decisions * self.interval if self._under_way else 0.0
         return self.revise(self.recognise(observation, time), Proposal(action, mask))
-
-    def _proposed(self, action: ArrayLike) -> Action:
-        """An action of the right type, whatever its values."""
-        if isinstance(self.actions, BoxActions):
-            return self.actions.checked("proposal", action)
-        if isinstance(action, np.ndarray | list):  # of one number, as policies predict it
-            if np.size(action) != 1:
-                raise ValueError(f"proposal has {np.size(action)} numbers; it must be a single one")
-            action = np.ravel(action)[0]
-        return action if type(action) is float else number("proposal", action)
 
     @transaction
     def recognise(self, observation: ArrayLike, time: float) -> Situation:

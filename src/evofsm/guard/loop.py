@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol, SupportsFloat
 import numpy as np
 
 from evofsm.fsm.validation import Floats
-from evofsm.guard.actions import Action, Choices, checked_mask, no_action
+from evofsm.guard.actions import Action, ActionSet, Choices, checked_mask, no_action, proposed
 from evofsm.guard.api import Controller, Proposal, Revision, Situation
 from evofsm.guard.guard import Guard
 
@@ -89,7 +89,9 @@ def run_episode(
     latest_row, count, score, is_over, failed = _whole(observation, None), 0, 0.0, False, False
     while not is_over:
         time = info.get("time", count * guard.interval)
-        proposal = _asked(guard, propose, latest_row, time) or Proposal(no_action(guard.actions))
+        proposal = _asked(guard.actions, propose, latest_row, time) or Proposal(
+            no_action(guard.actions)
+        )
         if isinstance(guard.actions, Choices) and proposal.mask is None:
             proposal = proposal._replace(mask=mask_of(observation, info))
         begin = perf_counter()
@@ -149,14 +151,17 @@ def _whole(observation: Any, held: Floats | None) -> Floats:
 
 
 def _asked(
-    guard: Guard, propose: Callable[[Floats, float], Action | Proposal], seen: Floats, time: float
+    actions: ActionSet,
+    propose: Callable[[Floats, float], Action | Proposal],
+    seen: Floats,
+    time: float,
 ) -> Proposal | None:
     """What the controller proposes; None where it fails to: someone has to go on driving."""
     try:
         reply = propose(seen.copy(), time)
         proposal = reply if isinstance(reply, Proposal) else Proposal(reply)
-        numbers = guard._proposed(proposal.action)
-        checked_mask(guard.actions, proposal.mask)
+        numbers = proposed(actions, proposal.action)
+        checked_mask(actions, proposal.mask)
     except Exception as error:
         _log.warning("controller failed at %g s: %r", time, error)
         return None
