@@ -260,7 +260,7 @@ class Guard:
         if judge is None:
             settings = {"n_actions": n_actions, "horizon": horizon, "seed": seed, **arguments}
             judge = LearntRisk(interval, low, high, **settings)
-        elif model is not None or backup is not None or np.size(names):
+        elif model is not None or backup is not None or (names is not None and np.size(names)):
             asks = "asks no model, no backup and no names: leave them out"
             raise ValueError(f"{type(judge).__name__} {asks}")
         machine = EvolvingFSM(
@@ -665,7 +665,7 @@ class Guard:
         if is_late and self._gaps == _MANY:
             lag = f"the latest {step:.3g} s, where interval is {self.interval:g} s"
             warnings.warn(
-                f"most observations come over {_GAP} intervals after the one before, {lag}: "
+                f"of late most observations come over {_GAP} intervals after the last one, {lag}: "
                 "nothing is learnt or carried across. Is the loop too slow, or is time not in s?",
                 stacklevel=7,
             )

@@ -472,7 +472,8 @@ class Terms:
         self._given = guard, observations, actions, observe, failed, penalty
         self.guard, self.space, self.penalty = guard, actions, penalty
         self._silent, self._has_decided = 0, False
-        self._observe, self._failed = observe or _flat(observations), failed
+        own: Observe | None = None if observe is None else lambda seen: observe(_own(seen))
+        self._observe, self._failed = own or _flat(observations), failed
         keys = tuple(observations.keys()) if isinstance(observations, Dict) else ()
         if not observe and guard.variables != keys and {*guard.variables} == {*keys}:
             raise ValueError(f"names are {guard.variables}, but the Dict is taken in order: {keys}")
@@ -523,15 +524,23 @@ class Terms:
         if self._failed is None or isinstance(self._failed, str):
             return step.terminated and (self._failed is not None or self.guard.failed is None)
         try:
-            return answered(self._failed(replace(step, observation=deepcopy(step.observation))))
+            return answered(self._failed(replace(step, observation=_own(step.observation))))
         except (AttributeError, KeyError, TypeError) as error:
             error.add_note(f"failed gets a step {StepResult.__slots__}, such as failed={_FAILED}")
             raise
 
     def look(self, observation: Any) -> Floats | None:
         """What the guard observes; None where there is nothing to judge."""
-        reply = None if observation is None else self._observe(deepcopy(observation))
+        reply = None if observation is None else self._observe(observation)
         return None if reply is None else np.array(reply, dtype=np.float64)
+
+
+def _own(observation: Any) -> Any:
+    """A copy, which a function may work in; the very one where it cannot be copied."""
+    try:
+        return deepcopy(observation)
+    except Exception:
+        return observation
 
 
 def _flat(space: Space[Any]) -> Observe:

@@ -32,13 +32,13 @@ _RAYS, _EDGE_HALVINGS, _DEEP = 64, 40, 0.05
 _RADII = tuple(0.1 * 1.3**k for k in range(20))
 
 
-def fails(state: State, z: Floats, episode: Episode, given: Given, *, moves: bool) -> State:
+def fails(state: State, z: Floats, episode: Episode, given: Given) -> State:
     """Learn where it fails, and where it ends, of observations ``z`` (T + 1, m) of an episode.
 
-    Where it failed before anybody could see how it ``moves``, a given function alone says where.
+    Where it failed too early to see how it moves, a given function alone says where.
     """
     settings, function = state.settings, given.failed
-    is_told = moves or function is not None
+    is_told = function is not None or not episode.early
     failed = episode.failed and is_told and bool(np.isfinite(z[-1]).all())
     rows = z[:-1] if episode.failed else z
     rows = rows[np.isfinite(rows).all(1)]
@@ -90,7 +90,8 @@ def _explained(state: State, *, failed: bool) -> State:
         for table in (was, rows)
     )
     # Where most came by chance that takes long, and finds nothing.
-    if failed or (not is_told.all() and 2 * was_told.sum() >= len(failures)):
+    is_many = len(failures) > state.settings.settled and 2 * was_told.sum() < len(failures)
+    if failed or not (is_told.all() or is_many):
         rows = failure.explain(FAILS, failures, survival)
     rows = failure.counted(rows, failures, survival)
     ends, fatal = failure.saying(table, ENDS, CRASHES), failure.saying(table, FATAL)

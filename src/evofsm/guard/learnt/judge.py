@@ -46,6 +46,8 @@ from evofsm.store import MOST_COUNTED, Place
 
 # Rows of an episode that are learnt from before it ends.
 _MOST_ROWS = 1024
+# Of an episode that failed after fewer nobody could see how it moves.
+_FEWEST = 4
 # No horizon that is given has more steps: memory and the time of a decision grow with it.
 _MAX_STEPS = 10_000
 # What a backup says to an action that is not allowed.
@@ -361,7 +363,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         soon = self._soon(memory.seconds)
         risk, low, high = np.array([self._risk(n, soon) for n in counts]).T
         distances = np.array([outcome.left for outcome in outcomes])
-        is_seen = memory.lost[1] > 0 or math.inf not in counts
+        is_seen = memory.lost[1] > 0 or not math.isinf(counts[0])
         evidence = float(memory.number) if is_seen else 0.0
         return Judgement(risk, low, high, distances, evidence, situation.seen)
 
@@ -485,7 +487,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
             z, u, latest = self._z, self._u, self._notes[-1]
             self._study(failed=False, terminated=False)
             self._z, self._u = z[-1 - stride :], u[-1 - stride :]  # the next change needs a step
-            self._notes = [(False, False, False)] * stride + [latest]
+            self._notes, self._goes_on = [(False, False, False)] * stride + [latest], True
 
     def follow(self, observation: ArrayLike, action: Any) -> None:
         """Keep up with what happens, without learning from it."""
@@ -536,9 +538,10 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         self._z, self._u, self._notes = [], [], []
         if not len(z) or not np.isfinite(z).all(1).any() or not (n or failed):
             return
+        is_early, fails_after = not self._goes_on and n < _FEWEST, self._fails_after
         refusals, losses, certificates = notes.T
         ends = failed, terminated
-        episode = Episode(z, u, *ends, refusals, losses, certificates, self._fails_after)
+        episode = Episode(z, u, *ends, refusals, losses, certificates, fails_after, is_early)
         if not self.n_variables:
             now = self.state
             blank = State.none(self.settings, z.shape[1], self.size, self.choices, now.horizon)
@@ -558,7 +561,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
     def start_episode(self) -> None:
         """What comes is not a consequence of what was."""
         self._step, self._z, self._u, self._notes = [], [], [], []
-        self._certified = self._holds = self._refused = self._lost = False
+        self._certified = self._holds = self._refused = self._lost = self._goes_on = False
         self._unsurvived, self._n_blind, self._fails_after = 0, 0, 0.0
         self._first = np.array(math.nan)
         self._used, self._ranks = np.zeros((self.size, 2)), np.arange(len(self.state.policies))

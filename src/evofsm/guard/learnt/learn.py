@@ -62,7 +62,7 @@ def learn(state: State, episode: Episode, given: Given) -> State:
         if given.model is not None:
             state = motion.told(state, model_of(state), safe, given.model, random)
     # Failure
-    state = danger.fails(state, z, episode, given, moves=moves)
+    state = danger.fails(state, z, episode, given)
     if len(state.forms):
         state = danger.dead_ends(state, model_of(state), safe, episode, before.survived)
     if not moves:

@@ -54,7 +54,7 @@ def are_jumps(z: Floats, unit: Floats) -> Flags:
 def without_glitches(z: Floats, unit: Floats) -> Floats:
     """Observations (T, m), NaN where a variable jumped there and back within two rows.
 
-    Not where that is how it moves: of two values, more than once; nor where most rows do so.
+    Not where that is how it moves: more than once, and else of two values; nor where most rows do.
     """
     if len(z) < 5:
         return z
@@ -64,7 +64,8 @@ def without_glitches(z: Floats, unit: Floats) -> Floats:
     pace = np.maximum(moves, np.vstack([moves[1:], moves[-1:]]))
     bad = np.abs(z - around) > JUMP * np.maximum(unit, pace)
     bad[[0, -1]] = False
-    between = (z > np.fmin.reduce(z)) & (z < np.fmax.reduce(z))
+    rest = np.where(bad, np.nan, z)
+    between = (rest > np.fmin.reduce(rest)) & (rest < np.fmax.reduce(rest))
     bad &= between.any(0) | (bad.sum(0) < 2)
     if 2 * bad.any(1).sum() > len(z):
         return z

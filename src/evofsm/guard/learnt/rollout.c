@@ -482,7 +482,7 @@ static void revise(evofsm_state *s, evofsm_decision *out) {
   } else if (ALLOWED > 0) {
     out->unsurvived = unsurvived = foresee(s, proposal);
   }
-  out->evidence *= ENDS_SEEN || (out->unsurvived >= 0 && unsurvived >= 0);
+  out->evidence *= ENDS_SEEN || out->unsurvived >= 0;
   unsurvived = ACTS ? unsurvived : out->unsurvived;
   if (is_known) {
     out->risk_proposed = risks[1 + out->unsurvived][0];

@@ -113,6 +113,7 @@ class Episode(NamedTuple):
     lost: Floats  #: (T,) 1 where nothing helped, even without a disturbance
     certified: Floats  #: (T,) 1 where some backup survived all
     fails_after: float  #: steps after which what was refused fails, at the latest
+    early: bool  #: whether it ended before four observations
 
     def every(self, stride: int) -> Episode:
         """Steps of so many decisions each, to the last observation; their actions in the mean."""
