@@ -34,9 +34,9 @@ from evofsm.io.tables import IN_UTC, SI, TIMES, UNITS, quoted_name, unit_of
 # A unit at the end of a column's name, behind another letter or as a word of its own.
 _WORD = "(?:^|[^A-Za-z]|(?<=[a-z])(?=[A-Z]))"
 _CALLED = re.compile(_WORD + "((?i:km[/_ ]?p?h|kph|mph|knots|feet|ft|cm|mm|km))[^A-Za-z]*$")
-_TIME_CALLED = re.compile(
-    _WORD + "((?i:[mnu\u00b5\u03bc]s|min(?:ute)?s?|h(?:ou)?rs?|days?|(?<![A-Za-z])[hd]))"
-    "(?:ec)?[^A-Za-z]*$"
+_TIME_CALLED = re.compile(  # but for times of day, and times per hour
+    _WORD + r"(?<![oO]f)(?<![oO]f.)(?<!per.)"
+    "((?i:[mnu\u00b5\u03bc]s|min(?:ute)?s?|h(?:ou)?rs?|days?|(?<![A-Za-z])[hd]))(?:ec)?[^A-Za-z]*$"
 )
 # Units of time that logs are in, of which that counts by which a row comes every 0.1 s or so.
 _SHORTER = ("ms", "us", "ns")

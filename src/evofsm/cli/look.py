@@ -210,7 +210,8 @@ def _first_rows(
     firsts = {name: table.first(name).strip() for name in table.columns if table.holds(name)}
     pairs = [*zip(firsts, [*firsts][1:], strict=False)]
     date_columns = [name for name, text in firsts.items() if is_date(text)]
-    alone = ((a, b) for a, b in pairs if a not in date_columns and ":" in firsts[b])
+    of_day = [name for name, text in firsts.items() if re.match(r".*:|\d{4}(\d\d)?$", text)]
+    alone = ((a, b) for a, b in pairs if a not in date_columns and b in of_day)
     together = (f"{a},{b}" for a, b in alone if is_date(f"{firsts[a]} {firsts[b]}"))
     early = next(table.pieces(Wanted([], date_columns))).texts if date_columns else {}
     table.skips.kinds.clear()  # said where all rows are read
@@ -241,7 +242,7 @@ def _first_rows(
                 odd[f"in column {name!r}, the first: {str(bad.first())!r}"] = len(bad)
     texts = [name for name in texts if frame[name].dtype == polars.String]
     numbers = [name for name in firsts if name in frame.columns and frame[name].dtype.is_numeric()]
-    compact = [(name,) for name in numbers if 1.99e11 < (frame[name][0] or 0.0) < 2.1e13]
+    compact = [(n,) for n in numbers if firsts[n].isdigit() and 1.99e11 < float(firsts[n]) < 2.1e13]
     apart = (names for names in [*zip(texts, strict=True), *pairs] if {*names} <= {*texts})
     titles = [*compact, *apart]
     for names in titles if not clock else ():

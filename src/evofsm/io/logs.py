@@ -995,8 +995,9 @@ class _Reader:
         rows = np.flatnonzero(starts)
         texts, ends = (key.gather(rows) for key in keys), [*rows[1:].tolist(), piece.rows]
         for row, end, *episode in zip(rows.tolist(), ends[: len(rows)], *texts, strict=True):
-            is_back = tuple(episode) in self._known and any(map(str.strip, episode))
-            if is_back and not piece.spared[row:end].all():  # what is between batches comes back
+            if piece.spared[row:end].all():  # what is between batches comes back
+                continue
+            if tuple(episode) in self._known and any(map(str.strip, episode)):
                 names = ", ".join(self._episode)
                 raise ValueError(
                     f"{piece.at(row)}: the episode {', '.join(text[:40] for text in episode)} "

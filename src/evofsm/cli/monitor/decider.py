@@ -398,7 +398,8 @@ class Decider:
         odd = [(k, name, z) for k, (name, z) in pairs if z and abs(z) in STAND_INS]
         centers = machine.centers if odd and (machine := self.guard.machine) else np.empty((0, 0))
         for k, name, z in odd:
-            if are_stand_ins(np.append(centers[:, k : k + 1], z))[-1]:
+            far = are_stand_ins(np.append(centers[:, k : k + 1], z))[-1]
+            if far and self._is_first(f"{name} is {z:g}"):
                 yield f"{name} is {z:g}, far from all others: a missing value? That is null"
 
     def _is_first(self, remark: str) -> bool:
