@@ -229,10 +229,7 @@ def test_between_batches_nothing_may_stand_or_what_is_left_out(tmp_path, pieces)
         (b"date Mon Nov 30 10:00:00.000 am 2026\nbase hex  timestamps absolute\n", "Vector (ASC)"),
         (b"tank,plant=a level=1.2,valve=3i 1465839830100400200\n", "line protocol of InfluxDB"),
         (b"$GPRMC,123519,A,4807.038,N,01131.000,E*6A\r\n", "holds sentences of NMEA 0183"),
-        (
-            b"SQLite format 3\0" + bytes(9) + b"CREATE TABLE plant(",
-            "of SQLite, and no bag",
-        ),
+        (b"SQLite format 3\0" + bytes(9) + b"CREATE TABLE plant(", "of SQLite, and no bag"),
         (HEADER.encode("utf-16-le"), "UTF-8 (an archive, binary data, or text in UTF-16"),
         (b"version https://git-lfs.github.com/spec/v1\n", "is a pointer of Git LFS"),
         (gzip.compress(b"PAR1" * 9, mtime=0), "is gzipped, and cannot be read so; unpack it"),
