@@ -282,7 +282,7 @@ def test_frozen_it_learns_nothing_and_decides_the_same_again(make, snapshot):
     assert snapshot(guard) == before
 
 
-def test_a_copy_goes_its_own_way(make, snapshot):
+def test_a_copy_goes_its_own_way_and_a_judge_of_which_there_is_none_is_told(make, snapshot):
     guard = make()
     guard.valve = guard.machine.valve = threading.Lock()  # as a class of one's own adds
     balance(guard, pushes(make, 20))
@@ -294,17 +294,13 @@ def test_a_copy_goes_its_own_way(make, snapshot):
     again = balance(bare, pushes(make, 20, 2), gusts=[0.19])[0]
     assert repr([one.executed for one in first]) == repr([one.executed for one in again])
     assert bare.machine is None
+    guard.judge.lock = threading.Lock()
+    with pytest.raises(TypeError) as told:
+        guard.copy()
+    assert "the judge or reviser cannot be copied" in told.value.__notes__[0]
 
 
 # -- What is kept -------------------------------------------------------------------------------
-
-
-def test_a_judge_that_cannot_be_copied_is_told_what_it_lacks():
-    judge = Balance()
-    judge.lock = threading.Lock()
-    with pytest.raises(TypeError) as told:
-        continuous(judge=judge).copy()
-    assert "the judge or reviser cannot be copied" in told.value.__notes__[0]
 
 
 def test_what_was_saved_goes_on_bit_for_bit(make, snapshot, tmp_path):
@@ -331,10 +327,8 @@ def test_what_a_file_cannot_hold_has_to_be_given_again(tmp_path):
         Guard.load(path, failed=lambda z: False)
     assert Guard.load(path, judge=Balance, failed=lambda z: z[0] > 1.0).failed is not None
     own = type("Own", (Choices,), {})(5)
-    for part in (
-        type("Own", (Unrevised,), {})(Choices(2)),
-        ActionReviser(Balance(index=True), own),
-    ):
+    unrevised = type("Own", (Unrevised,), {})(Choices(2))
+    for part in (unrevised, ActionReviser(Balance(index=True), own)):
         with pytest.raises(ValueError, match=r"no file can hold .* of (Choices|Own)"):
             Guard.of(part, interval=DT).save(path)
     for name, does in (("save", "wrote nothing"), ("load", "gave None")):
@@ -416,36 +410,34 @@ def test_a_search_keeps_to_what_is_allowed():
 # -- What is refused ----------------------------------------------------------------------------
 
 
+#: A single number.
+ONE = {"low": -1.0, "high": 1.0}
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({}, "give low and high of the action, or n_actions"),
-        ({"low": -1.0, "high": 1.0, "n_actions": 3}, "not both"),
+        (ONE | {"n_actions": 3}, "not both"),
         ({"low": [-1.0], "high": [1.0], "judge": LatentRisk(-1.0, DT)}, "a vector of 1"),
         ({"low": 1.0, "high": -1.0}, "low must be below high"),
         ({"n_actions": 4, "judge": Balance(index=True)}, "5 pushes"),
-        ({"low": -1.0, "high": 1.0, "judge": Balance(dt=0.2)}, r"every 0\.2 s"),
-        ({"low": -1.0, "high": 1.0, "horizon": -1.0}, "horizon"),
+        (ONE | {"judge": Balance(dt=0.2)}, r"every 0\.2 s"),
+        (ONE | {"horizon": -1.0}, "horizon"),
         ({"low": -2.5, "high": 1.0, "judge": LatentRisk(-4.5, DT)}, "set of actions ends at -2.5"),
+        (ONE | {"judge": type("Half", (Balance,), {"end": None})()}, r"it lacks \['end'\]"),
+        *((ONE | {"tolerance": p}, "tolerance") for p in (0.0, math.nan)),
+        *((ONE | {"interval": dt}, "interval") for dt in (0.0, -1.0, math.nan)),
+        (ONE | {"failed": True}, r"failed is .*; it must be a function"),
+        (ONE | {"mode": "on"}, "mode is 'on'; it is one of off, shadow, act"),
         (
-            {"low": -1.0, "high": 1.0, "judge": type("Half", (Balance,), {"end": None})()},
-            r"it lacks \['end'\]",
-        ),
-        *(({"low": -1.0, "high": 1.0, "tolerance": p}, "tolerance") for p in (0.0, math.nan)),
-        *(({"low": -1.0, "high": 1.0, "interval": dt}, "interval") for dt in (0.0, -1.0, math.nan)),
-        ({"low": -1.0, "high": 1.0, "failed": True}, r"failed is .*; it must be a function"),
-        ({"low": -1.0, "high": 1.0, "mode": "on"}, "mode is 'on'; it is one of off, shadow, act"),
-        (
-            {"low": -1.0, "high": 1.0, "judge": type("No", (Balance,), {"fallback": None})()},
+            ONE | {"judge": type("No", (Balance,), {"fallback": None})()},
             r"judge is .*No object.* has no fallback \(is it a subclass of evofsm.guard.ActionJ",
         ),
-        ({"low": -1.0, "high": 1.0, "judge": Balance}, "must be an object with a method judge"),
-        (
-            {"low": -1.0, "high": 1.0, "audit": "log.jsonl"},
-            r"audit is .* has no begin, seen, decided, ended \(is it",
-        ),
-        ({"low": -1.0, "high": 1.0, "judge": None, "names": "ab"}, "names is 'ab'; it must be"),
-        ({"low": -1.0, "high": 1.0, "names": np.array(["a", "b"])}, "no names: leave them out"),
+        (ONE | {"judge": Balance}, "must be an object with a method judge"),
+        (ONE | {"audit": "log.jsonl"}, r"audit is .* has no begin, seen, decided, ended \(is it"),
+        (ONE | {"judge": None, "names": "ab"}, "names is 'ab'; it must be"),
+        (ONE | {"names": np.array(["a", "b"])}, "no names: leave them out"),
         ({"low": [0.0, 0.0], "high": [1.0], "judge": None}, "low has 2 components and high has 1"),
         ({"low": [0.0, 2.0], "high": [1.0, 2.0]}, "in component 1; low must be below high"),
         ({"low": [-math.inf], "high": [1.0]}, "low is .* must be finite"),
@@ -465,7 +457,7 @@ def test_what_makes_no_guard_is_refused(settings, message):
         Guard(**({"interval": DT, "judge": Balance()} | settings))
 
 
-def test_settings_of_the_reviser_are_looked_at_where_they_are_set():
+def test_settings_are_looked_at_where_they_are_set():
     guard = continuous()
     guard.mode, guard.reviser.tolerance = "shadow", 0.5
     assert (guard.reviser.mode, guard.tolerance) == (Mode.SHADOW, 0.5)
@@ -476,9 +468,6 @@ def test_settings_of_the_reviser_are_looked_at_where_they_are_set():
     unrevised = Guard.of(Unrevised(IntervalActions(-2.5, 2.5, 0.3)), interval=DT)
     with pytest.raises(AttributeError, match="Unrevised has no mode"):
         unrevised.mode = "shadow"
-
-
-def test_settings_of_a_guard_are_looked_at_where_they_are_set():
     guard = Guard(-1.0, 1.0, interval=DT)
     for name, value in (("failed", "terminated"), ("shadow", 0), ("explaining", "no")):
         with pytest.raises(TypeError, match=f"^{name} is"):
