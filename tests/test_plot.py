@@ -139,7 +139,7 @@ def guard():
     return guard
 
 
-def test_what_failed_is_tinted_and_what_was_survived_is_not(guard):
+def test_what_failed_is_tinted_and_what_is_not_in_view_is_said(guard):
     ax, known = plot.experience(guard, new()), guard.judge.state
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("x [m]", "y [m]")
     survived, failed = (line.get_xydata() for line in ax.lines[:2])
@@ -149,9 +149,6 @@ def test_what_failed_is_tinted_and_what_was_survived_is_not(guard):
     assert not tinted.contains_points(survived).any()
     for ring, centre in zip(ax.patches, known.centres, strict=True):
         assert ring.center == pytest.approx(centre[:2])
-
-
-def test_what_other_variables_tell_of_failure_is_said(guard):
     ax = plot.experience(guard, new(), variables=(0, 2))
     said = [text.get_text() for text in ax.get_legend().texts]
     assert said[0] == "survived (blank: nothing was seen)"

@@ -19,7 +19,7 @@ def saved(tmp_path_factory):
     return folder, guard.machine
 
 
-def test_every_state_is_explained_with_the_words_of_its_family(evofsm, saved):
+def test_states_are_explained_an_observation_is_recognised_and_an_action_counted(evofsm, saved):
     folder, machine = saved
     answer = evofsm("explain", folder, "--state", "all")
     assert answer.exit_code == 0
@@ -28,10 +28,6 @@ def test_every_state_is_explained_with_the_words_of_its_family(evofsm, saved):
     assert numbers == [f"#{state + 1}" for state in range(machine.n_states)]
     assert all("m/s)" in line for line in told)
     assert max(map(len, answer.stdout.splitlines())) <= 80
-
-
-def test_an_observation_is_recognised_and_an_action_counted(evofsm, saved):
-    folder, machine = saved
     found = evofsm("explain", folder, "--observation", "9,14,14", "--action", "12", "--json")
     (one,) = json.loads(found.stdout)["situations"]
     assert one["state"] == machine.model().recognise([9.0, 14.0, 14.0]).argmax()

@@ -520,12 +520,9 @@ def test_all_some_those_of_a_type_or_a_share_which_is_the_same_in_every_run():
     for name in ("", "car.", "flow_0."):
         half = sum(choose(0.5)(TYPES, f"{name}{k}") for k in range(1000))
         assert half == pytest.approx(500, abs=50)  # three standard deviations
-
-
-@pytest.mark.parametrize("vehicles", ["none", "x%", "120%", "1", 0.0, -0.1, 1.5, float("nan")])
-def test_anything_else_is_refused(vehicles):
-    with pytest.raises(ValueError, match="vehicles is"):
-        choose(vehicles)
+    for wrong in ("none", "x%", "120%", "1", 0.0, -0.1, 1.5, float("nan")):
+        with pytest.raises(ValueError, match="vehicles is"):
+            choose(wrong)
 
 
 @pytest.mark.slow

@@ -59,7 +59,7 @@ def test_a_step_is_an_interval_and_pays_the_distance():
         assert reward == info["distance"] == pytest.approx(0.5 * 2.0 * 0.25**2 * (2 * k - 1))
 
 
-def test_a_collision_terminates_costs_and_is_a_failure():
+def test_a_collision_terminates_costs_and_is_a_failure_and_the_end_of_time_truncates():
     env = CarFollowing(collision_cost=100.0)
     *before, (observation, reward, terminated, truncated, info) = drive(
         env, lambda *_: [2.5], options={"index": 0}
@@ -69,10 +69,7 @@ def test_a_collision_terminates_costs_and_is_a_failure():
     assert reward == info["distance"] - 100.0
     assert observation[0] == info["gap"] <= 0.0
     assert not any(answer[-1]["failed"] for answer in before)
-
-
-def test_the_end_of_time_truncates():
-    answers = drive(CarFollowing(), lambda *_: [0.0], options={"index": 0})
+    answers = drive(env, lambda *_: [0.0], options={"index": 0})
     _, reward, terminated, truncated, info = answers[-1]
     assert (terminated, truncated, info["failed"], reward) == (False, True, False, 0.0)
     assert info["time"] == pytest.approx(35.0, abs=0.02)

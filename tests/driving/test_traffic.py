@@ -113,15 +113,12 @@ def test_the_risk_is_that_of_the_worst_and_names_it():
     assert "object 1, cutting in" in one.why(several)
 
 
-def test_whoever_crosses_is_braked_for():
+def test_whoever_crosses_is_braked_for_and_who_comes_towards_one_in_full():
     walker = Object("walker", 28.3, -3.0, 0.0, vy=1.5, length=0.5, width=0.5)
     revision = decide(scene(walker))
     assert revision.executed <= -4.0
     assert "crossing" in revision.reason
     assert decide(scene(walker._replace(y=3.0))).executed == 1.0
-
-
-def test_who_comes_towards_one_is_braked_for_in_full():
     assert decide(scene(ahead(400.0, -25.0))).executed == 1.0
     revision = decide(scene(ahead(80.0, -25.0)))
     assert (revision.risk_proposed, revision.executed) == (1.0, LOW)

@@ -103,11 +103,10 @@ def test_a_batch_that_cannot_be_right(machine, Z, I, starts, error, words):
         (HIDDEN["whole numbers"], TypeError, "failures .*masked"),
     ],
 )
-def test_failures_of_a_batch_that_cannot_be_right(machine, failures, error, words):
+def test_failures_of_a_batch_or_of_an_observation_that_cannot_be_right(
+    machine, failures, error, words
+):
     refuses(machine, lambda m: m.learn_many(ROWS, [0] * 3, [], failures), error, words)
-
-
-def test_a_failure_that_is_neither_true_nor_false(machine):
     refuses(machine, lambda m: m.observe([0.0, 1.0], failed="no"), TypeError, "failed is 'no'")
 
 

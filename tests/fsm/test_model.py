@@ -88,13 +88,11 @@ def test_the_action_decides_the_first_step_and_all_alike_further_ones(
     np.testing.assert_allclose(machine.predict(action, horizon), expected, rtol=1e-14)
 
 
-def test_at_the_start_of_an_episode_the_forecast_comes_from_the_uniform_belief(machine):
+def test_a_forecast_may_lack_a_beginning_or_an_action(machine):
     machine.start_episode()
     assert machine.belief.tolist() == [0.5, 0.5]
     np.testing.assert_allclose(machine.predict(0), [2 / 3, 1 / 3], rtol=1e-15)
-
-
-def test_without_an_action_all_count_alike_from_the_first_step_on(machine):
+    # Without an action all count alike from the first step on.
     model = dataclasses.replace(machine.model(), decisions=np.array([[3.0, 3.0], [1.0, 1.0]]))
     np.testing.assert_allclose(model.propagate([1.0, 0.0]), [3 / 7, 4 / 7])
     np.testing.assert_allclose([1.0, 0.0] @ model.averaged_matrix, [13 / 28, 15 / 28])

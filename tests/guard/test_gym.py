@@ -415,15 +415,12 @@ def test_a_wrapper_under_which_nothing_can_be_learnt_is_named(name, given, told,
     getattr(wrappers, name)(RevisedActions(cart(), guard, **how), *given)  # as it was advised
 
 
-def test_a_list_of_infos_is_made_above_the_guard():
+def test_a_list_of_infos_is_made_above_the_guard_and_statistics_that_change_no_more_are_none():
     listed = wrappers.vector.DictInfoToList
     many, guard = SyncVectorEnv([cart]), guard_for(Discrete(2))
     with pytest.warns(UserWarning, match=r"DictInfoToList below the guard .*in DictInfoToList"):
         RevisedVectorActions(listed(many), guard)
     listed(RevisedVectorActions(many, guard)).reset()  # as it was advised
-
-
-def test_statistics_that_change_no_more_are_as_good_as_none():
     frozen = wrappers.NormalizeObservation(cart())
     frozen.update_running_mean = False
     RevisedActions(frozen, guard_for(Discrete(2)))
@@ -972,13 +969,6 @@ def test_what_hides_agents_from_the_guard_is_named(name):
     assert len(told) == 1
 
 
-def test_agents_that_observe_differently_are_refused():
-    sizes, observe = iter((1, 2)), lambda z: z[: next(sizes)]
-    env = RevisedAgents(Crowd(2, 4), guard_for(ONE), observe=observe)
-    with pytest.raises(ValueError, match=r"different numbers of variables, \{'a0': 1, 'a1': 2\}"):
-        env.reset()
-
-
 def test_what_an_agent_meets_after_a_step_without_an_action_is_no_consequence():
     class Turns(Crowd):
         def step(self, actions):
@@ -993,8 +983,11 @@ def test_what_an_agent_meets_after_a_step_without_an_action_is_no_consequence():
     assert told == [(1, False), (5, True), (3, True)]
 
 
-def test_agents_that_take_turns_are_told_of_the_parallel_interface():
-    turns = parallel_to_aec(Crowd(4))
+def test_agents_that_observe_differently_or_take_turns_are_told_what_to_do():
+    turns, sizes = parallel_to_aec(Crowd(4)), iter((1, 2))
+    unlike = RevisedAgents(Crowd(2, 4), guard_for(ONE), observe=lambda z: z[: next(sizes)])
+    with pytest.raises(ValueError, match=r"different numbers of variables, \{'a0': 1, 'a1': 2\}"):
+        unlike.reset()
     for wrap in (RevisedAgents, RevisedActions):
         with pytest.raises(TypeError, match=r"PettingZoo, as parallel_env\(\).*aec_to_parallel"):
             wrap(turns, guard_for(ONE))

@@ -233,15 +233,12 @@ def test_frozen_scores_count_only_where_the_controller_alone_never_failed():
     assert not arms([arrived] * 7, [sooner] * 20).helps(learning=False)
 
 
-def test_a_guard_under_which_hardly_any_episode_reaches_its_goal_is_told_of():
+def test_a_guard_that_keeps_from_the_goal_or_refuses_nothing_that_fails_is_told_of():
     alone = [*[(50, "e", None)] * 4, *[(30, "f", None)] * 5]
     assert arms([(60, "", None)] * 19 + [(60, "e", None)], alone).spoiling == (
         "keeps what it guards from ending by itself: 1 of 20 guarded episodes, alone 4 of 9"
     )
     assert "itself" not in arms([(60, "", None)] * 15 + [(60, "e", None)] * 5, alone).spoiling
-
-
-def test_a_guard_that_refuses_nothing_while_episodes_fail_is_told_of():
     harm = Harm()
     for driven in ((30, 0, 30), (0, 30, 30), (30, 0, 30), (30, 0, 30)):
         assert not harm.spoiling

@@ -145,16 +145,13 @@ def test_while_the_own_brakes_are_unknown_it_brakes_in_full_for_a_second():
     assert LOW < reviser.revise(HERE, Proposal(1.0)).executed <= -1.0
 
 
-def test_where_nothing_is_executed_brakes_are_not_tested():
+def test_brakes_are_not_tested_where_nothing_is_executed_nor_on_where_the_driver_takes_over():
     reviser = ActionReviser(Changing(), ACTIONS, mode=Mode.SHADOW)
     first = reviser.revise(HERE, Proposal(1.0))
     assert LOW < first.advised <= -1.0  # the least change, and no test in full
     assert "in full" not in first.reason
     assert "1.5 m/s² assumed" in first.reason
-
-
-def test_a_test_of_the_brakes_ends_where_the_driver_takes_over():
-    reviser = ActionReviser(Changing(), ACTIONS)
+    reviser.mode = Mode.ACT
     assert "in full" in reviser.revise(HERE, Proposal(1.0)).reason
     reviser.risk.danger = False
     reviser.mode = Mode.SHADOW

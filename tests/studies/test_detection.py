@@ -50,13 +50,10 @@ def test_alarms_hold_for_a_second_and_come_true_if_the_danger_follows_soon():
     assert detection.count_alarms(raised(40, 5), safe, 0.5, 0.25) == (1, 4)
 
 
-def test_lead_time_is_that_of_the_alarm_that_stays_on():
+def test_lead_time_is_that_of_the_alarm_that_stays_on_and_what_came_after_the_end_is_left_out():
     three = exposure(True, False, True)
     score = np.concatenate([raised(40, 3, *range(30, 40)), np.ones(40), raised(40, 10)])
     assert detection.lead_times(score, three, 0.5).tolist() == [2.5, 0.0]
-
-
-def test_what_would_have_come_after_the_end_is_left_out():
     safe, crash = exposure(False), exposure(True)
     assert len(safe.cases(Danger.COLLISION).truth) == 21  # the last five seconds are not known
     truth = crash.cases(Danger.COLLISION).truth

@@ -51,15 +51,12 @@ def invoke(*arguments, kind=Made):
     return CliRunner().invoke(app, [str(one) for one in arguments])
 
 
-def test_options_of_a_command_are_the_annotated_fields():
+def test_options_of_a_command_are_the_annotated_fields_and_it_writes_its_page_and_rows(tmp_path):
     told = json.loads(invoke("--json", "--throws", 3).stdout)
     assert told == {"rows": [{"throws": 3, "odds": None}]}
     assert json.loads(invoke("--json", "--short").stdout)["rows"][0]["throws"] == 10
     assert invoke("--depth", 3).exit_code == 2
     assert invoke("--seed", -1).exit_code == 2
-
-
-def test_a_command_writes_its_page_and_rows_and_says_where(tmp_path):
     said = invoke("--out", tmp_path / "out").stdout
     assert "Is it?" in said
     assert str(tmp_path / "out" / "index.html") in said
