@@ -45,14 +45,11 @@ def python(folder, *arguments, **environment):
     return result.stdout
 
 
-def test_a_state_rule(tmp_path):
+def test_a_state_rule_and_a_judge(tmp_path):
     write("Add a state rule", tmp_path)
     said = python(tmp_path, "-m", "evofsm", "check", "my_rule:Coarse")
     assert "a_machine_takes_it" in said
     assert "0 failed" in said
-
-
-def test_a_judge(tmp_path):
     python(tmp_path, "-c", write("Add a judge", tmp_path))
     assert "0 failed" in python(tmp_path, "-m", "evofsm", "check", "my_judge:Kettle")
 

@@ -22,11 +22,8 @@ def test_without_the_extra_one_line_says_what_to_install(missing):
         f"import sys; sys.modules[{missing!r}] = None\n"
         "sys.argv = ['evofsm', 'paper']\nfrom evofsm.__main__ import main\nmain()"
     )
-    assert result.returncode == 2
-    assert result.stderr == (
-        "evofsm: the command line needs typer and rich: "
-        "pip install 'evofsm[cli,plot,sumo,tables]'\n"
-    )
+    needs = "the command line needs typer and rich: pip install 'evofsm[cli,plot,sumo,tables]'"
+    assert (result.returncode, result.stderr) == (2, f"evofsm: {needs}\n")
 
 
 def test_control_c_while_it_is_loaded_is_one_line():

@@ -137,10 +137,8 @@ def test_risk_lies_in_its_interval_and_grows_with_the_acceleration(gap, speed, l
     assert ((judged.low >= 0.0) & (judged.low <= judged.risk + 1e-12)).all()
     assert ((judged.high <= 1.0) & (judged.high >= judged.risk - 1e-12)).all()
     assert judged.evidence == 4
-    said = (
-        "manoeuvres of leaders: 4 given or seen, the hardest by 4.5 m/s², and one assumed, by 10.0 "
-    )
-    assert said in risk.told_by_experience
+    said = "leaders: 4 given or seen, the hardest by 4.5 m/s², and one assumed, by 10.0 "
+    assert f"manoeuvres of {said}" in risk.told_by_experience
 
 
 @pytest.mark.parametrize(

@@ -176,7 +176,7 @@ def test_one_brakes_no_harder_than_who_is_behind_survives():
     assert followed.executed == alone.executed < -4.5
 
 
-def test_who_is_behind_and_cannot_be_spared_is_braked_for_softly_unless_it_is_sure_ahead():
+def test_who_is_behind_and_cannot_be_spared_is_braked_for_softly_and_who_stands_stays():
     assert decide(scene(ahead(10.0, 0.0), behind(3.0, 15))).executed == LOW
     revision = decide(scene(ahead(27.0, 0.0), behind(0.5, 15)))
     assert -DECEL <= revision.executed < 0.0
@@ -186,8 +186,6 @@ def test_who_is_behind_and_cannot_be_spared_is_braked_for_softly_unless_it_is_su
     creeping = Scene(me._replace(vx=0.18), [ahead(0.03, 0.0), behind(0.1, 0.3)])
     assert decide(creeping.rows(most=2)).executed < -0.5 * 0.18**2 / 0.03  # and who creeps stops
 
-
-def test_who_stands_and_goes_on_standing_is_not_changed():
     guard = guard_for_traffic(LOW, HIGH, DECEL, INTERVAL, mode=Mode.SHADOW)
     rows = Scene(Object("me", 0.0, 0.0, 0.0), [ahead(0.2, 0.0)]).rows(most=2)
     assert guard.decide(rows, 0.0).advised == 0.0

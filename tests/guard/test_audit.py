@@ -386,7 +386,9 @@ def test_what_no_log_holds_is_a_forgery(driven, tmp_path, kind, change):
     assert "was forged" in result.finding.explanation
 
 
-def test_a_name_given_twice_is_found_behind_its_own_hash(driven, tmp_path):
+def test_a_name_given_twice_is_found_behind_its_own_hash_and_who_made_a_log_is_named(
+    driven, tmp_path
+):
     """Some readers take the first of them, others the last."""
     lines = driven.read_bytes().splitlines(keepends=True)
     text = lines[-1].rpartition(b',"hash":"')[0]
@@ -395,9 +397,6 @@ def test_a_name_given_twice_is_found_behind_its_own_hash(driven, tmp_path):
     lines[-1] = twice + b',"hash":"' + sha256(twice).hexdigest().encode() + b'"}\n'
     (tmp_path / "forged").write_bytes(b"".join(lines))
     assert audit(tmp_path / "forged").finding.record == len(lines)
-
-
-def test_who_made_a_log_otherwise_is_named(driven, tmp_path):
     forge(driven, tmp_path / "forged", "start", 0, lambda one: one["made_by"].update(numpy="1.0"))
     (other_maker,) = audit(tmp_path / "forged").other_makers
     assert (other_maker.name, other_maker.recorded) == ("numpy", "1.0")

@@ -948,10 +948,8 @@ def test_whom_anothers_failure_ends_did_not_end_by_itself():
 
     spy, ended = Spy(), []
     spy.end = lambda z, *, failed, terminated: ended.append((failed, terminated))
-    env = RevisedAgents(
-        Together(2, 4), guard_for(ONE, spy), failed=lambda step: step.observation[0] < 5.0
-    )
-    drive_agents(env, 0.0)
+    near = {"failed": lambda step: step.observation[0] < 5.0}
+    drive_agents(RevisedAgents(Together(2, 4), guard_for(ONE, spy), **near), 0.0)
     assert ended == [(True, False), (False, False)]
 
 

@@ -68,6 +68,9 @@ def test_settings_and_seeds_that_are_taken_can_be_kept_and_others_are_refused():
     LearntRisk(0.1, -1.0, 1.0, settings=numbers, seed=1 << 53).save(file := BytesIO())
     again = LearntRisk.load(BytesIO(file.getvalue()))
     assert (again.settings, again.seed) == (numbers, 1 << 53)
+    for wrong in ({"dt": 0.0}, {"horizon": 0.0}, {"n_actions": 0}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            LearntRisk(**({"dt": 0.1, "n_actions": 2} | wrong))
     for seed in (-1, 1 << 63, 1 << 128):
         with pytest.raises(ValueError, match=rf"seed is {seed}; it must be from 0 to 2\*\*53"):
             Guard(-1.0, 1.0, interval=0.1, seed=seed)
