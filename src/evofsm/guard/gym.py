@@ -472,8 +472,8 @@ class Terms:
         self._given = guard, observations, actions, observe, failed, penalty
         self.guard, self.space, self.penalty = guard, actions, penalty
         self._silent, self._has_decided = 0, False
-        own: Observe | None = None if observe is None else lambda seen: observe(_own(seen))
-        self._observe, self._failed = own or _flat(observations), failed
+        wrapper: Observe | None = None if observe is None else lambda seen: observe(_own(seen))
+        self._observe, self._failed = wrapper or _flat(observations), failed
         keys = tuple(observations.keys()) if isinstance(observations, Dict) else ()
         if not observe and guard.variables != keys and {*guard.variables} == {*keys}:
             raise ValueError(f"names are {guard.variables}, but the Dict is taken in order: {keys}")

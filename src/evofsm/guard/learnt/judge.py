@@ -47,7 +47,7 @@ from evofsm.store import MOST_COUNTED, Place
 # Rows of an episode that are learnt from before it ends.
 _MOST_ROWS = 1024
 # Of an episode that failed after fewer nobody could see how it moves.
-_FEWEST = 4
+_FEWEST_SEEN = 4
 # No horizon that is given has more steps: memory and the time of a decision grow with it.
 _MAX_STEPS = 10_000
 # What a backup says to an action that is not allowed.
@@ -538,7 +538,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         self._z, self._u, self._notes = [], [], []
         if not len(z) or not np.isfinite(z).all(1).any() or not (n or failed):
             return
-        is_early, fails_after = not self._goes_on and n < _FEWEST, self._fails_after
+        is_early, fails_after = not self._goes_on and n < _FEWEST_SEEN, self._fails_after
         refusals, losses, certificates = notes.T
         ends = failed, terminated
         episode = Episode(z, u, *ends, refusals, losses, certificates, fails_after, is_early)
