@@ -137,13 +137,10 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
         for name, unit in units.items()
     ]
     if columns.failed and not noted.failing:
-        goes = []
-        for (name, _), (start, *more) in ((k, v) for k, v in noted.compared.items() if v):
-            if isinstance(start, str):
-                goes.append(f"{name} is {', '.join(map(repr, [start, *more]))}")
-            else:
-                text = f"{name}, as compared, goes from {start:.6g} to {more[0]:.6g} "
-                goes.append(text + SI.get(noted.units.get(name, ""), ""))
+        goes = [f"{name} is {', '.join(map(repr, texts))}" for name, texts in noted.texts.items()]
+        for name, (low, high) in ((k, v) for k, v in noted.compared.items() if v):
+            text = f"{name}, as compared, goes from {low:.6g} to {high:.6g} "
+            goes.append(text + SI.get(noted.units.get(name, ""), ""))
         text = ": ".join([f"no row meets --failed {quote(columns.failed)}", *goes])
         warnings.append(text.rstrip())
     is_untold = time in noted.untold and time not in units and not noted.resampled

@@ -124,8 +124,9 @@ class Noted:
     began: float = 0.0  #: time 0, where that is a date, since 1970 [s]
     in_utc: bool = False  #: whether times of day are, wherever the log is from
     failing: int = 0  #: rows that meet what tells of failures
-    #: By column compared for that, and whether with numbers: ends of its range in SI, or texts.
-    compared: dict[tuple[str, bool], list[Any]] = field(default_factory=dict)
+    #: By column compared for that, the ends of its range in SI, or texts that were there.
+    compared: dict[str, list[float]] = field(default_factory=dict)
+    texts: dict[str, list[str]] = field(default_factory=dict)
     fastest: dict[str, float] = field(default_factory=dict)  #: by variable, beyond belief [m/s]
     longest_step: float = 0.0  #: the usual one, beyond belief [s]
     #: By variable, the number below 0 or far out (0 where there are several), and in how many rows.
@@ -1096,14 +1097,14 @@ class _Reader:
     def _note_compared(self, piece: Piece) -> None:
         """What stands in the columns that tell of failures, should no row meet what is asked."""
         for term in self._failed.terms:
-            kind = term.column, term.of_number
-            entries: list[Any] = self._noted.compared.setdefault(kind, [])
             if term.of_number:
+                ends = self._noted.compared.setdefault(term.column, [])
                 values = piece.numbers[term.column]
-                values = np.append(entries, values[np.isfinite(values)])
-                entries[:] = [values.min(), values.max()] if len(values) else []
+                values = np.append(ends, values[np.isfinite(values)])
+                ends[:] = [values.min(), values.max()] if len(values) else []
             elif term.sign:
-                entries[:] = sorted({*entries, *piece.texts[term.column].unique()})[:_MANY_TEXTS]
+                texts = self._noted.texts.setdefault(term.column, [])
+                texts[:] = sorted({*texts, *piece.texts[term.column].unique()})[:_MANY_TEXTS]
 
     def _count_unknown(self, piece: Piece, unknown: Bools, starts: Bools) -> None:
         """Count rows without an action, but the last ones of episodes, which need none."""
