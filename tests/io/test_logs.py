@@ -542,12 +542,18 @@ def test_rows_without_a_leader_end_an_episode(tmp_path, pieces, nothing):
 
 @pytest.mark.parametrize("sign", "\t|,")
 @pytest.mark.parametrize("first", ["10,125", "20"])
-def test_decimal_commas_are_known_by_one_that_parts_no_thousands(tmp_path, sign, first):
+def test_decimal_commas_are_known_by_one_that_parts_no_thousands(
+    tmp_path, sign, first, monkeypatch
+):
     gaps = [first] * 6 + ["12,375"]
     rows = [f'{k} "{gap}" 10 "{"0,125" if k == 6 else 9}" 1' for k, gap in enumerate(gaps)]
     header = "time gap v_follower v_leader a_follower".replace(" ", sign)
     path = write(tmp_path / "a.csv", [row.replace(" ", sign) for row in rows], header)
     assert together(path)[0] == [float(gap.replace(",", ".")) for gap in gaps]
+    table = CsvTable(path)
+    monkeypatch.setattr(tables, "_CSV_BYTES", 1)  # row by row; most of them have no comma
+    numbers = [piece.numbers["gap"][0] for piece in table.pieces(Wanted(["gap"]))]
+    assert numbers == [float(gap.replace(",", ".")) for gap in gaps]
 
 
 def test_a_number_may_name_a_column_and_a_text_has_no_decimal_commas(tmp_path):

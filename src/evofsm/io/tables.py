@@ -669,9 +669,9 @@ class CsvTable(Table):
         names = {f"column_{columns.index(name) + 1}": name for name in wanted.all}
         kinds: dict[str, Any] = {f"column_{k + 1}": polars.String for k in range(len(columns))}
         numbers = {place: polars.Float64 for place, name in names.items() if name in wanted.numbers}
-        separator, has_commas = self._dialect.separator, self._dialect.has_commas
-        if has_commas and separator == ",":
-            return None
+        separator = self._dialect.separator
+        # At commas, decimal ones are within quotes, and the block is none of plain lines.
+        has_commas = self._dialect.has_commas and separator != ","
         dialect: Any = {"separator": separator, "decimal_comma": has_commas}
         for schema in (kinds | numbers, kinds):
             try:
