@@ -152,7 +152,10 @@ def file_kind(path: str) -> Kind:
         raise ValueError(f"{path} is empty")
     if b'{"__metadata__"' in head:
         raise ValueError(f"{path} holds what was learnt, and is no log: evofsm inspect prints it")
-    foreign = [says for mark, says in _FOREIGN.items() if head.startswith(mark)]
+    marks = [mark for mark in _FOREIGN if head.startswith(mark)]
+    # A column may be called as a mark of letters alone; binary data goes on behind that.
+    marks = [mark for mark in marks if not mark.strip().isalnum() or _CONTROL.search(head)]
+    foreign = [_FOREIGN[mark] for mark in marks]
     if foreign := foreign or [says for text, says in _NO_TABLE.items() if re.match(text, head)]:
         raise ValueError(f"{path} {foreign[0].replace('FILE', path)}")
     tables = {*re.findall(rb"CREATE TABLE \W?(\w+)", head)}
@@ -163,8 +166,8 @@ def file_kind(path: str) -> Kind:
         raise ValueError(f"{path} is gzipped, and cannot be read so; unpack it: gzip -dk {path}")
     if head.startswith(_MCAP):
         return "bag" if head[_PROFILE:].startswith(b"ros2") else "mcap"
-    marks: dict[bytes, Kind] = {_PARQUET: "parquet", _SQLITE: "bag", b"<": "xml"}
-    for mark, kind in marks.items():
+    kinds: dict[bytes, Kind] = {_PARQUET: "parquet", _SQLITE: "bag", b"<": "xml"}
+    for mark, kind in kinds.items():
         if head.startswith(mark):
             return kind
     if b"\0" in head[:64]:  # further down it is a bad row
