@@ -223,9 +223,16 @@ def test_a_first_look_says_what_it_cannot_tell(evofsm):
     assert "two columns are called oil; each needs its own name" in looked
     assert "a failure? event==LOW (5 times" in looked
     end, *more = "***End_of_Header***", "Date\t2025/03/03\t", "X_Value\tlevel\tComment"
-    rows = (f"{k / 10}\t{k % 17}\t" for k in range(200))
-    Path("log.lvm").write_text("\n".join([end, "Samples\t9\t", more[0], end, more[1], *rows]))
-    assert "--time X_Value" in evofsm("learn", "log.lvm").stdout
+    for tab in ("\t", ""):  # which stands before a comment
+        above = "Channels\t1\t", "Samples\t9\t", more[0], end, more[1]
+        rows = [f"{k / 10}\t{k % 17}{tab}" for k in range(200)]
+        lines = [end, "", *above, *rows[:20], "", *above, *rows[20:40], "", *above, *rows[40:]]
+        Path("log.lvm").write_text("\n".join(lines))
+        command = evofsm("learn", "log.lvm").stdout.replace("\\\n", "").rpartition("  evofsm ")[2]
+        assert "--time X_Value" in command
+        found = said(evofsm(*shlex.split(command)))
+        assert "rows 200, one every 0.1 s" in found
+        assert "episodes 3" in found
 
 
 def test_signals_of_two_clocks_are_held_as_it_is_proposed(evofsm):

@@ -583,7 +583,7 @@ class CsvTable(Table):
         rows = [at for at, line in enumerate(lines) if line.strip() and not _COMMENT.match(line)]
         rows = [at for at in rows if not lines[at].startswith("sep=")]
         ends = [place for place, at in enumerate(rows, 1) if lines[at].startswith(_LABVIEW)]
-        rows = rows[ends[-1] :] if ends else rows
+        rows = rows[ends[:2][-1] :] if ends else rows  # there may be more segments
         counts = [sum(map(bool, headers[at])) for at in rows], [len(headers[at]) for at in rows]
         usual, size = (max(n, key=n.count, default=0) for n in counts)
 
@@ -697,15 +697,19 @@ class CsvTable(Table):
         anew, headers = list[int](), list[int]()
         places = [columns.index(name) for name in wanted.all]
         may_name = any(name.encode() in block for name in wanted.all)
-        last_line = 0
+        last_line, is_labview = 0, {"X_Value", "Comment"} <= {*columns}
         while True:
             try:
                 for fields in filter(None, reader):
                     line = reached + reader.line_num
+                    if is_labview and len(fields) == len(columns) - 1:
+                        fields.append("")  # no comment, and no tab before it
                     if may_name and self._named_anew(fields, wanted, line):
                         columns = _names(fields)
                         places = [columns.index(name) for name in wanted.all]
                         headers.append(len(rows))
+                    elif is_labview and not is_value(fields[0] or "0"):  # above a segment
+                        left_out.append((line, ""))
                     elif len(fields) == len(columns):
                         rows.append((line, [fields[place] for place in places]))
                     elif _COMMENT.match(fields[0]):
