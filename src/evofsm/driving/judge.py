@@ -36,7 +36,7 @@ from evofsm.fsm.model import FSMModel
 from evofsm.fsm.proportions import wilson_bounds
 from evofsm.fsm.sharing import Retraced, step
 from evofsm.fsm.validation import Floats, positive, real_array, refuse_unusable, usable_array
-from evofsm.guard import TOLERANCE, Judgement, Situation
+from evofsm.guard import TOLERANCE, Judgement, LearntRisk, Situation
 from evofsm.guard.actions import ActionSet, BoxActions, nearest_bounds
 from evofsm.guard.api import LearningJudge, Trial, is_missing
 from evofsm.store import COUNT, SIZE, SMALLEST, Kind, Numbers, Place
@@ -54,8 +54,6 @@ SLIGHT = 0.1
 STANDS = 0.1
 # Where a situation is not sure, it may be worse by so many standard deviations.
 _CAUTION = 2.5
-# From so many observations on end that lack something on, an estimate is not known (`LearntRisk`).
-_BLIND = 5
 # Nearly no gap [m]: smaller than any that counts as no collision for who moves.
 _ALMOST = 1e-9
 
@@ -253,7 +251,7 @@ class LatentRisk(Retraced, LearningJudge):
         here = self._cautious(situation.observation)
         actions = usable_array("accelerations", accelerations)
         table, evidence = self.manoeuvres.table, float(len(self.manoeuvres))
-        if self.perception.unseen + 1 >= _BLIND and is_missing(situation.observation):
+        if self.perception.unseen + 1 >= LearntRisk.BLIND and is_missing(situation.observation):
             evidence = math.nan
         if not is_whole(here):  # where one is cannot be told: nothing can be survived for sure
             sure = np.ones(len(actions))
@@ -390,7 +388,11 @@ class LatentRisk(Retraced, LearningJudge):
             "ALMOST": _ALMOST,
             "DOUBT": perception._OWN if self.brakes.known else perception._OWN_UNKNOWN,
             **{"ANOTHER": perception._ANOTHER_LEADER, "EXACT": not any(self.perception.noise)},
-            **{"EVIDENCE": float(len(self.manoeuvres)), "ONCOMING": ONCOMING, "BLIND": _BLIND},
+            **{
+                "EVIDENCE": float(len(self.manoeuvres)),
+                "ONCOMING": ONCOMING,
+                "BLIND": LearntRisk.BLIND,
+            },
             **{"TABLE": self.manoeuvres.table.shape[1], "harder": self.manoeuvres.table},
             **{"noise": self.perception.noise, "option_low": lowest, "option_high": highest},
         }

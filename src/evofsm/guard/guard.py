@@ -399,8 +399,13 @@ class Guard:
     @failed.setter
     def failed(self, failed: Callable[[NDArray[np.float64]], bool] | None) -> None:
         self._failed = function("failed", failed, "lambda z: z[0] <= 0")
-        if isinstance(judge := getattr(self.reviser, "risk", self.judge), LearntRisk):
+        if isinstance(judge := self._action_judge, LearntRisk):
             judge.failed = None if failed is None else partial(asked, failed)
+
+    @property
+    def _action_judge(self) -> Any:
+        """What says how dangerous actions are; where nobody does, the judge that learns."""
+        return getattr(self.reviser, "risk", self.judge)
 
     @property
     def learn(self) -> bool:
@@ -624,7 +629,7 @@ class Guard:
         """An observation that judge and machine can take in; NaN stays."""
         z = real_array("observation", observation, 1)
         z.setflags(write=False)  # judge, reviser and logger are shown it
-        judge, machine = getattr(self.reviser, "risk", self.judge), self.machine
+        judge, machine = self._action_judge, self.machine
         count = len(self.variables) or getattr(judge, "n_variables", 0)
         count = count or (0 if machine is None else machine.n_variables) or len(self._held)
         if count and len(z) != count:
@@ -637,7 +642,7 @@ class Guard:
 
     def beyond(self, z: NDArray[np.float64]) -> tuple[str, str] | None:
         """The first variable of an observation (m,) that cannot be so, and why; NaN can."""
-        least, most = ends_of(getattr(self.reviser, "risk", self.judge), len(z))
+        least, most = ends_of(self._action_judge, len(z))
         if True not in (wrong := ((z < least) | (z > most)).tolist()):
             return None
         k = wrong.index(True)
@@ -863,7 +868,7 @@ class Guard:
     @alone
     def __str__(self) -> str:
         """Its judge, what it learnt from, and what it knows of failure, a line each."""
-        judge, actions = getattr(self.reviser, "risk", self.judge), self.actions
+        judge, actions = self._action_judge, self.actions
         if isinstance(actions, Choices):
             span = f"{actions.n_actions} actions"
         else:

@@ -55,6 +55,7 @@ _FOREIGN = {
     b"TDSm": "is TDMS of LabVIEW; write its channels as CSV: npTDMS",
     b"ULog\x01": "is a log of PX4 (ULog); write it as CSV: ulog2csv of pyulog",
     b"\xa3\x95": "is a log of ArduPilot; write it as CSV: mavlogdump.py of pymavlink",
+    b"ORC": "is Apache ORC; write it as Parquet: pyarrow",
     b"Obj\1": "is Avro; write it as CSV or Parquet: polars.read_avro",
     b"\x80\4\x95": "is a pickle of Python, which may run anything; write its table as Parquet",
     b"\x80\5\x95": "is a pickle of Python, which may run anything; write its table as Parquet",
@@ -72,7 +73,6 @@ _FOREIGN = {
 }
 # And texts that are no tables.
 _NO_TABLE = {
-    rb"ORC[\0-\x1f\x80-\xff]": "is Apache ORC; write it as Parquet: pyarrow",
     rb"\(\d+\.\d+\) \w+ [0-9A-F]+#": "is a CAN log (candump); decode it to CSV: cantools",
     rb"date .*\n\s*base (hex|dec)": "is a CAN log of Vector (ASC); decode it to CSV: "
     "python-can, cantools",
