@@ -265,12 +265,15 @@ class Traffic(Study):
 
     @property
     def there(self) -> list[str]:
-        """Networks that can be driven on."""
+        """Networks that were asked for; a ValueError names one that is not there."""
         asked, game = lib.names_in(self.worlds), demos()
         for each in asked:
-            if each not in (*OWN, *DEMOS) and not (game and (game / f"{each}.sumocfg").exists()):
+            if each in DEMOS and not game:
+                fault = f"{each} is a demo of SUMO, and there are none here"
+                raise ValueError(f"{fault}: pip install eclipse-sumo, or --worlds {','.join(OWN)}")
+            if each not in OWN and not (game and (game / f"{each}.sumocfg").exists()):
                 raise ValueError(f"there is no network {each}; there are {', '.join(OWN)}")
-        return [each for each in asked if each in OWN or game]
+        return asked
 
     def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:
         """Simulate all, then learn and drive the family."""

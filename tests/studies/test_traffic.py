@@ -22,8 +22,9 @@ def test_late_drivers_are_simulated_beside_themselves_without_guards():
     assert beside["bound"] == pytest.approx(3.69, abs=0.01)  # of none in one simulation
 
 
-def test_without_sumos_demos_they_are_left_out_and_others_refused(monkeypatch):
+def test_networks_that_are_not_there_are_refused(monkeypatch):
     monkeypatch.setattr(traffic, "demos", lambda: None)
-    assert Traffic(worlds="A10KW,drop").there == ["drop"]
+    with pytest.raises(ValueError, match="A10KW is a demo of SUMO, .* pip install eclipse-sumo"):
+        Traffic(worlds="drop,A10KW").run()
     with pytest.raises(ValueError, match="no network nowhere; there are drop, road, grid"):
         Traffic(worlds="nowhere").run()
