@@ -425,7 +425,7 @@ ONE = {"low": -1.0, "high": 1.0}
         (ONE | {"judge": Balance(dt=0.2)}, r"every 0\.2 s"),
         (ONE | {"horizon": -1.0}, "horizon"),
         ({"low": -2.5, "high": 1.0, "judge": LatentRisk(-4.5, DT)}, "set of actions ends at -2.5"),
-        (ONE | {"judge": type("Half", (Balance,), {"end": None})()}, r"it lacks \['end'\]"),
+        (ONE | {"judge": type("Half", (Balance,), {"end": None})()}, "that learns .* no end "),
         *((ONE | {"tolerance": p}, "tolerance") for p in (0.0, math.nan)),
         *((ONE | {"interval": dt}, "interval") for dt in (0.0, -1.0, math.nan)),
         (ONE | {"failed": True}, r"failed is .*; it must be a function"),

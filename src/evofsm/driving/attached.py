@@ -420,26 +420,26 @@ class Guarding:
         wish = self._vehicle.getSpeedWithoutTraCI(car.id)
         # Under a limit some models (EIDM) drive a little slower than they say.
         limit, slack = (wish, 0.0) if car.mode is None else (car.limit, _COARSE * self._seeing.dt)
+        is_faster = speed > limit + _DIFFERS
         is_slower = speed < min(limit, wish) - max(slack, _DIFFERS)
-        if speed > limit + _DIFFERS:
-            car.script = -math.inf
-        elif is_slower and not self._vehicle.isStopped(car.id):
-            most = car.body.hardest * self._seeing.dt + _DIFFERS
-            car.script = speed
-            if car.mode is not None and not car.taken & _OFF and car.speed - speed > most:
-                # So does SUMO itself, as where lanes merge: the next steps say who it was.
-                self._take(car, car.mode | _ON | _OFF)
-                return True
-        elif not speed <= car.script + _DIFFERS:
+        is_slower = is_slower and not self._vehicle.isStopped(car.id)
+        differs = is_faster or is_slower
+        if not (differs or speed <= car.script + _DIFFERS):
             car.script = math.nan
             return False
-        elif car.mode is not None and speed < car.script - _DIFFERS:
-            car.script = speed  # it brakes on
+        most = car.body.hardest * self._seeing.dt + _DIFFERS
+        is_sudden = is_slower and not car.taken & _OFF and car.speed - speed > most
+        brakes_on = not differs and speed < car.script - _DIFFERS
+        if car.mode is not None and (is_sudden or brakes_on):
+            # So does SUMO itself, as where lanes merge: the next steps say who it was.
+            car.script = speed
+            self._take(car, car.mode | _ON | _OFF)
             return True
         if not self.overruled:
             warnings.warn(_OVERRULED.format(car.id), RuntimeWarning, stacklevel=5)
         self.overruled += 1
-        if is_slower or speed > limit:  # else the speed that is set may be the guard's own
+        if differs:  # else the speed that is set may be the guard's own
+            car.script = speed if is_slower else -math.inf
             self._hand_back(car)
         return True
 

@@ -213,9 +213,6 @@ class LatentRisk(Retraced, LearningJudge):
         self.perception.clear()
         self._commands = (0.0, 0.0)
 
-    def _become(self, again: Self) -> None:
-        vars(self).update(vars(again))
-
     @step
     def end(self, observation: ArrayLike | None, *, failed: bool, terminated: bool = False) -> None:
         """A manoeuvre under way counts as it is; how it ended teaches nothing."""
@@ -388,11 +385,8 @@ class LatentRisk(Retraced, LearningJudge):
             "ALMOST": _ALMOST,
             "DOUBT": perception._OWN if self.brakes.known else perception._OWN_UNKNOWN,
             **{"ANOTHER": perception._ANOTHER_LEADER, "EXACT": not any(self.perception.noise)},
-            **{
-                "EVIDENCE": float(len(self.manoeuvres)),
-                "ONCOMING": ONCOMING,
-                "BLIND": LearntRisk.BLIND,
-            },
+            **{"EVIDENCE": float(len(self.manoeuvres)), "ONCOMING": ONCOMING},
+            "BLIND": LearntRisk.BLIND,
             **{"TABLE": self.manoeuvres.table.shape[1], "harder": self.manoeuvres.table},
             **{"noise": self.perception.noise, "option_low": lowest, "option_high": highest},
         }

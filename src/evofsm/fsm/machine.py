@@ -450,10 +450,6 @@ class EvolvingFSM(Retraced):
     savepoint = alone(Retraced.savepoint)
     _twin = staticmethod(copy.copy)  # which has arrays of its own
 
-    @alone
-    def _become(self, again: Self) -> None:
-        self._learnt, self._settings = again._learnt, again._settings
-
     # -- Files and copies -------------------------------------------------------------------------
 
     def copy(self) -> Self:

@@ -68,11 +68,10 @@ def transaction(method: Method) -> Method:
 class Retraced:
     """What is taken back by going through its latest steps again: that costs nothing before.
 
-    What changes it is under `step`; ``_become`` makes it what a copy is.
+    What changes it is under `step`.
     """
 
     _known: tuple[Any, list[tuple[Any, Any, Any]]] | None = None  # a copy, and the steps since
-    _become: Callable[[Any], None]
     _twin: Callable[[Any], Any] = staticmethod(deepcopy)
 
     def savepoint(self) -> Rollback:
@@ -85,8 +84,7 @@ class Retraced:
             again = self._twin(before)
             for method, args, kwargs in steps[:count]:
                 method(again, *args, **kwargs)
-            self._become(again)
-            self._known = None
+            vars(self).update(unshared(again), _known=None)
 
         return rollback
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable
 from contextlib import suppress
+from copy import copy
+from operator import attrgetter
 from typing import Any, SupportsFloat, SupportsIndex, TypeAlias, TypeVar
 
 import numpy as np
@@ -62,6 +64,25 @@ def function(name: str, value: _F, such_as: str) -> _F:
     if value is not None and not callable(value):
         raise TypeError(f"{name} is {value!r}; it must be a function, such as {name}={such_as}")
     return value
+
+
+def setting(name: str, check: Callable[[str, Any], Any], doc: str) -> Any:
+    """A property that is what ``check`` makes of what it is set to, or refuses."""
+
+    def change(owner: Any, value: Any) -> None:
+        setattr(owner, f"_{name}", check(name, value))
+
+    return property(attrgetter(f"_{name}"), change, doc=doc)
+
+
+def ask(name: str, function: Callable[..., Any], kind: Callable[[Any], _F], *at: Any) -> _F:
+    """What a function that was given says, which may work in place, as what it has to be."""
+    try:
+        return kind(function(*map(copy, at)))
+    except Exception as error:
+        place = ", ".join(map(str, at))
+        error.add_note(f"{name} was asked of {place}; it is asked near what was observed, too")
+        raise
 
 
 def positive(name: str, value: SupportsFloat) -> float:

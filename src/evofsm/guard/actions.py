@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.validation import Floats, number, real_array, whole
+from evofsm.fsm.validation import Floats, real_array, whole
 
 # Cells that a box is divided into for the machine, at most: 9 x 9.
 _CELLS = 81
@@ -189,19 +189,6 @@ def same_action(one: Action, other: Action) -> bool:
 def no_action(actions: ActionSet) -> Action:
     """What stands where nothing is proposed: NaN, in a box a vector of it."""
     return np.full(len(actions.low), math.nan) if isinstance(actions, BoxActions) else math.nan
-
-
-def proposed(actions: ActionSet | None, action: ArrayLike) -> Action:
-    """An action of the right type, whatever its values; any numbers, if no set is known."""
-    if actions is None:
-        return real_array("proposal", np.atleast_1d(action), 1)
-    if isinstance(actions, BoxActions):
-        return actions.checked("proposal", action)
-    if isinstance(action, np.ndarray | list):  # of one number, as policies predict it
-        if np.size(action) != 1:
-            raise ValueError(f"proposal has {np.size(action)} numbers; it must be a single one")
-        action = np.ravel(action)[0]
-    return action if type(action) is float else number("proposal", action)
 
 
 def put_into(actions: ActionSet, action: Action) -> Action:

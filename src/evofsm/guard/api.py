@@ -314,6 +314,7 @@ class RiskMeasure(Protocol):
 # Of each kind of part its protocol, and what is asked of it.
 _PARTS_HAVE = {
     "judge": ("ActionJudge", "judge why labels fallback trial effective choose refuse_unfit"),
+    "judge that learns": ("LearningJudge", "dt learn follow start_episode end save load"),
     "reviser": ("Reviser", "actions revise start_episode"),
     "audit": ("DecisionLogger", "begin seen decided ended"),
 }

@@ -26,16 +26,13 @@ from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import Labels, in_a_line
 from evofsm.fsm.rules import reach
 from evofsm.fsm.sharing import Rollback, alone, share, transaction, unshared
-from evofsm.fsm.validation import function, positive, real_array, truth, usable_array
+from evofsm.fsm.validation import ask, function, positive, real_array, setting, truth, usable_array
 from evofsm.guard.actions import (
     Action,
     ActionSet,
     BoxActions,
     Choices,
-    checked_mask,
     fixed,
-    no_action,
-    proposed,
     put_into,
     same_action,
 )
@@ -57,7 +54,7 @@ from evofsm.guard.api import (
 )
 from evofsm.guard.learnt.judge import LearntRisk
 from evofsm.guard.parts import outline, rebuild, settings_of
-from evofsm.guard.reviser import NOTHING, ActionReviser, Mode, is_spoken, make_usable
+from evofsm.guard.reviser import NOTHING, ActionReviser, Mode, is_spoken, make_usable, proposed
 from evofsm.store import COUNT, SIZE, Kind, Numbers, Place
 
 # Intervals that a range of actions is divided into for the machine.
@@ -107,8 +104,6 @@ class DecisionLogger(Protocol):
 
 # Settings that stand in a file as they are.
 _PLAIN_SETTINGS = ("explaining", "interval", "learn", "n_episodes", "n_failed", "shadow")
-# What a judge has that learns.
-_LEARNS = ("dt", "learn", "follow", "start_episode", "end", "save", "load")
 # The files of the machine and of the judge, as bytes.
 KIND = Kind(
     "guard",
@@ -131,15 +126,6 @@ def _of_reviser(name: str, doc: str) -> Any:
         setattr(guard.reviser, name, value)
 
     return property(attrgetter(f"reviser.{name}"), change, doc=doc)
-
-
-def _truth(name: str, doc: str) -> Any:
-    """A setting that is True or False, and may be changed at any time."""
-
-    def change(guard: Guard, value: Any) -> None:
-        vars(guard)[f"_{name}"] = truth(name, value)
-
-    return property(attrgetter(f"_{name}"), change, doc=doc)
 
 
 class Guard:
@@ -252,7 +238,7 @@ class Guard:
         shadow: bool = True,
     ) -> None:
         actions = _actions(low, high, n_actions)
-        if isinstance(judge, type) or not (judge is None or hasattr(judge, "judge")):
+        if isinstance(judge, type):
             raise TypeError(f"judge is {judge!r}; it must be an object with a method judge")
         interval = positive("interval", interval)
         soon = None if horizon is None else max(1, round(positive("horizon", horizon) / interval))
@@ -339,9 +325,7 @@ class Guard:
         if judge is None and isinstance(action_judge, LearningJudge):
             judge = action_judge
         elif judge is None and hasattr(action_judge, "learn"):
-            lacks = [name for name in _LEARNS if getattr(action_judge, name, None) is None]
-            fault = "the judge has a method learn, but not all of a LearningJudge"
-            raise ValueError(f"{fault}: it lacks {lacks}")
+            refuse_lacking("judge that learns", action_judge)
         for part, of in (("judge", judge), ("reviser", reviser)):
             dt = getattr(of, "dt", None) or self.interval
             if not math.isclose(dt, self.interval):
@@ -383,13 +367,9 @@ class Guard:
 
     mode = _of_reviser("mode", "How far its reviser goes, a `Mode`; may be changed at any time.")
     tolerance = _of_reviser("tolerance", "Highest risk that its reviser accepts, in (0, 1).")
-    explaining = _truth("explaining", "Whether the machine's experience is said of each decision.")
-    shadow = _truth("shadow", "Whether proposals pass in episodes where it was not shown to help.")
-
-    @property
-    def interval(self) -> float:
-        """Time between two decisions [s], of which all that it learns is."""
-        return self._interval
+    explaining = setting("explaining", truth, "Whether experience is said of each decision.")
+    shadow = setting("shadow", truth, "Whether proposals pass where it was not shown to help.")
+    interval = property(attrgetter("_interval"), doc="Time between two decisions [s].")
 
     @property
     def failed(self) -> Callable[[NDArray[np.float64]], bool] | None:
@@ -549,12 +529,10 @@ class Guard:
                 "environments with one guard?); run them all under RevisedVectorActions or "
                 "RevisedAgents, or give each a guard of its own, such as guard.copy(); then reset"
             )
-        action, mask = proposal if isinstance(proposal, Proposal) else (proposal, None)
-        action = no_action(self.actions) if action is None else proposed(self.actions, action)
-        mask = checked_mask(self.actions, mask)
+        proposal = proposed(self.actions, proposal)
         if time is None:
             time = self._decisions * self.interval if self._under_way else 0.0
-        return self.revise(self.recognise(observation, time), Proposal(action, mask))
+        return self.revise(self.recognise(observation, time), proposal)
 
     @transaction
     def recognise(self, observation: ArrayLike, time: float) -> Situation:
@@ -579,14 +557,16 @@ class Guard:
         else:
             # What comes after a gap does not follow from what was before. The machine begins
             # first, as a judge learns from what it made of it.
-            if intake and intake & Intake.GAP:
-                if self.machine is not None and self._learn:
-                    self.machine.start_episode()
-                bridges = getattr(self.judge, "bridges", 0.0)
-                if self.judge is not None and not 0.0 < time - before <= bridges:
-                    if self._learn:
-                        self.judge.end(None, failed=False)
-                    self.judge.start_episode()
+            step, bridges = time - before, getattr(self.judge, "bridges", 0.0)
+            is_gap = bool(intake and intake & Intake.GAP)
+            if is_gap and self.machine is not None and self._learn:
+                self.machine.start_episode()
+            is_gap = is_gap and not 0.0 < step <= bridges
+            if is_gap and self.judge is not None:
+                if self._learn:
+                    self.judge.end(None, failed=False)
+                self.judge.start_episode()
+            self._count_gaps(step, is_gap=is_gap)
             situation = self._latest = self._recognised(z, time, intake)
         if self.audit is not None:
             self.audit.seen(row, time)
@@ -609,8 +589,7 @@ class Guard:
             intake = Intake.PARTIAL
             if len(self._held) == len(z):  # what was seen of them before is still held
                 latest_row = np.where(np.isnan(z), self._held, z)
-        self._count_gaps(step := time - self._time)  # NaN of an episode's first one
-        if step < 0.0 or step > _GAP * self.interval:
+        if time < self._time or time - self._time > _GAP * self.interval:  # false of the first
             intake |= Intake.GAP
         self._held, self._time = latest_row.copy(), time
         return intake, z
@@ -663,16 +642,15 @@ class Guard:
                 stacklevel=7,
             )
 
-    def _count_gaps(self, step: float) -> None:
+    def _count_gaps(self, step: float, *, is_gap: bool) -> None:
         """Warn where most observations come after a gap in time: nothing is learnt across."""
-        is_late = step > max(_GAP * self.interval, getattr(self.judge, "bridges", 0.0))
-        self._gaps = self._gaps + 1 if is_late else max(0, self._gaps - 1)
-        if is_late and self._gaps == _MANY:
+        self._gaps = self._gaps + 1 if is_gap else max(0, self._gaps - 1)
+        if is_gap and self._gaps == _MANY:
             lag = f"the latest {step:.3g} s, where interval is {self.interval:g} s"
             warnings.warn(
                 f"of late most observations come over {_GAP} intervals after the last one, {lag}: "
                 "nothing is learnt or carried across. Is the loop too slow, or is time not in s?",
-                stacklevel=7,
+                stacklevel=6,
             )
 
     def _recognised(self, z: NDArray[np.float64], time: float, intake: Intake) -> Situation:
@@ -1043,10 +1021,7 @@ def _warm_machine() -> None:
 def ends_of(judge: ActionJudge | None, m: int) -> NDArray[np.float64]:
     """(2, m) ndarray: least and most that each of m variables can be."""
     ranges = getattr(judge, "ranges", ((-_LARGEST_VALUE, _LARGEST_VALUE),))
-    try:
-        return _resized(ranges, m)
-    except TypeError:  # lists, of which none is remembered
-        return _resized.__wrapped__(ranges, m)
+    return _resized(tuple(map(tuple, ranges)), m)  # lists cannot be remembered
 
 
 @cache
@@ -1063,11 +1038,7 @@ def answered(reply: Any) -> bool:
 
 def asked(failed: Callable[[NDArray[np.float64]], bool], z: NDArray[np.float64]) -> bool:
     """Whether a function says that an observation is a failure."""
-    try:
-        return answered(failed(z.copy()))
-    except Exception as error:
-        error.add_note(f"failed was asked of {z}; it is also asked around what was observed")
-        raise
+    return ask("failed", failed, answered, z)
 
 
 def _actions(low: ArrayLike | None, high: ArrayLike | None, n_actions: int | None) -> ActionSet:
@@ -1099,7 +1070,7 @@ def _bytes(saved: EvolvingFSM | LearningJudge | None) -> NDArray[np.uint8]:
         if again is None:
             raise ValueError(f"{name}.load gave None: what it learnt would be lost")
         if isinstance(saved, ObservingJudge):
-            rows, harm = (j and (*j.harm[1:], j.harm.rows.tolist()) for j in (again, saved))
+            rows, harm = ((*j.harm[1:], j.harm.rows.tolist()) for j in (again, saved))
             if rows != harm:  # by which a loaded guard knows whether to act
                 raise ValueError(f"{name}.save does not keep harm, or load it")
     return np.frombuffer(file.getvalue(), np.uint8)

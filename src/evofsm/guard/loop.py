@@ -12,9 +12,10 @@ from typing import Any, NamedTuple, Protocol, SupportsFloat
 import numpy as np
 
 from evofsm.fsm.validation import Floats
-from evofsm.guard.actions import Action, ActionSet, Choices, checked_mask, no_action, proposed
+from evofsm.guard.actions import Action, ActionSet, Choices, no_action
 from evofsm.guard.api import Controller, Proposal, Revision, Situation
 from evofsm.guard.guard import Guard
+from evofsm.guard.reviser import proposed
 
 _log = logging.getLogger(__name__)
 
@@ -89,9 +90,7 @@ def run_episode(
     latest_row, count, score, is_over, failed = _whole(observation, None), 0, 0.0, False, False
     while not is_over:
         time = info.get("time", count * guard.interval)
-        proposal = _asked(guard.actions, propose, latest_row, time) or Proposal(
-            no_action(guard.actions)
-        )
+        proposal = _asked(guard.actions, propose, latest_row, time)
         if isinstance(guard.actions, Choices) and proposal.mask is None:
             proposal = proposal._replace(mask=mask_of(observation, info))
         begin = perf_counter()
@@ -155,17 +154,14 @@ def _asked(
     propose: Callable[[Floats, float], Action | Proposal],
     seen: Floats,
     time: float,
-) -> Proposal | None:
-    """What the controller proposes; None where it fails to: someone has to go on driving."""
+) -> Proposal:
+    """What the controller proposes; no action where it fails to: someone has to go on driving."""
     try:
-        reply = propose(seen.copy(), time)
-        proposal = reply if isinstance(reply, Proposal) else Proposal(reply)
-        numbers = proposed(actions, proposal.action)
-        checked_mask(actions, proposal.mask)
+        proposal = proposed(actions, propose(seen.copy(), time))
     except Exception as error:
         _log.warning("controller failed at %g s: %r", time, error)
-        return None
-    if np.isfinite(numbers).all():
+        return Proposal(no_action(actions))
+    if np.isfinite(proposal.action).all():
         return proposal
     _log.warning("controller proposed %s at %g s", proposal.action, time)
-    return None
+    return Proposal(no_action(actions))

@@ -78,6 +78,7 @@ class RevisedAgents(gym._Settled, BaseParallelWrapper[Any, Any, Any]):  # type: 
             lane.end(failed=False)
             lane.is_open = False
         observations, infos = parts_of(self.env.reset(seed=seed, options=options))
+        infos = _whole(infos)
         self._begin(observations, infos)
         return observations, infos
 
@@ -86,13 +87,13 @@ class RevisedAgents(gym._Settled, BaseParallelWrapper[Any, Any, Any]):  # type: 
         decisions = {agent: self._enter(agent).decide(action) for agent, action in actions.items()}
         executed = {agent: decision.executed for agent, decision in decisions.items()}
         observations, rewards, terminated, truncated, infos = parts_of(self.env.step(executed), 5)
-        infos, rewards = dict(infos), dict(rewards)
+        infos, rewards = _whole(infos), dict(rewards)
         alive, steps = {*self.env.agents}, dict[Any, StepResult]()
         for agent in (agent for agent, lane in self._lanes.items() if lane.is_open):
             is_over, has_left = bool(terminated.get(agent)), agent not in alive
             ends = is_over, bool(truncated.get(agent)) or (has_left and not is_over)
             row, reward = observations.get(agent), rewards.get(agent, math.nan)
-            steps[agent] = StepResult(row, reward, *ends, infos.get(agent) or {})
+            steps[agent] = StepResult(row, reward, *ends, infos.get(agent, {}))
         over = [agent for agent, step in steps.items() if step.terminated]
         if len(over) > 1:  # whom another's failure ends does not end by itself
             fails = {agent: self._lanes[agent].terms.failed(steps[agent]) for agent in over}
@@ -108,7 +109,7 @@ class RevisedAgents(gym._Settled, BaseParallelWrapper[Any, Any, Any]):  # type: 
             if agent in rewards:
                 rewards[agent] = decision.paid(rewards[agent])
             if agent in infos or agent in terminated:
-                infos[agent] = {**(infos.get(agent) or {}), **decision.info}
+                infos[agent] = {**infos.get(agent, {}), **decision.info}
         here = {agent: row for agent, row in observations.items() if agent in self.env.agents}
         self._begin(here, infos)
         return observations, rewards, terminated, truncated, infos
@@ -116,7 +117,7 @@ class RevisedAgents(gym._Settled, BaseParallelWrapper[Any, Any, Any]):  # type: 
     def _begin(self, observations: _Each, infos: _Each) -> None:
         agents = [agent for agent in observations if not self._enter(agent).is_open]
         for agent in agents:
-            self._lanes[agent].begin(observations[agent], infos.get(agent) or {})
+            self._lanes[agent].begin(observations[agent], infos.get(agent, {}))
         lanes = self._lanes.items() if agents else ()
         sizes = {agent: len(lane.seen) for agent, lane in lanes if lane.seen is not None}
         if len({*sizes.values()}) > 1:
@@ -129,3 +130,8 @@ class RevisedAgents(gym._Settled, BaseParallelWrapper[Any, Any, Any]):  # type: 
             spaces = self.env.observation_space(agent), self.env.action_space(agent)
             self._lanes[agent] = Lane(self._terms(*spaces), shared=True)
         return self._lanes[agent]
+
+
+def _whole(infos: _Each) -> _Each:
+    """The info of each agent, {} for None."""
+    return {agent: info or {} for agent, info in infos.items()}

@@ -12,24 +12,28 @@ import warnings
 from copy import copy
 from enum import Enum
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.sharing import Rollback
-from evofsm.fsm.validation import Floats, action_name, check_index, probability
+from evofsm.fsm.validation import Floats, action_name, check_index, number, probability, setting
 from evofsm.guard.actions import (
     Action,
     ActionSet,
+    BoxActions,
     Choices,
     Mask,
     action_text,
+    checked_mask,
     distances,
     fixed,
     is_usable,
     limits,
     nearest_bounds,
+    no_action,
     put_into,
     same_action,
 )
@@ -74,8 +78,20 @@ class Mode(Enum):
         raise ValueError(f"mode is {value!r}; it is one of {', '.join(m.value for m in cls)}")
 
 
-# What makes a setting of what it is set to, or refuses it.
-_SETTABLE: dict[str, Any] = {"mode": Mode, "tolerance": partial(probability, "tolerance")}
+def proposed(actions: ActionSet, reply: Proposal | ArrayLike | None) -> Proposal:
+    """What a controller wants, of the right type, whatever its values; of None no action."""
+    action, mask = reply if isinstance(reply, Proposal) else (reply, None)
+    if action is None:
+        action = no_action(actions)
+    elif isinstance(actions, BoxActions):
+        action = actions.checked("proposal", action)
+    elif isinstance(action, np.ndarray | list):  # of one number, as policies predict it
+        if np.size(action) != 1:
+            raise ValueError(f"proposal has {np.size(action)} numbers; it must be a single one")
+        action = np.ravel(action)[0]
+    if not isinstance(actions, BoxActions) and type(action) is not float:
+        action = number("proposal", action)
+    return Proposal(action, checked_mask(actions, mask))
 
 
 class Usable(NamedTuple):
@@ -194,8 +210,10 @@ class ActionReviser:
         self._far, self._clipped = _CLEARLY * (self._high - self._low), 0
         self.start_episode()
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        super().__setattr__(name, _SETTABLE[name](value) if name in _SETTABLE else value)
+    mode = setting(
+        "mode", lambda _, mode: Mode(mode), "How far it goes; may be changed at any time."
+    )
+    tolerance = setting("tolerance", probability, "Highest latent risk that is accepted.")
 
     def start_episode(self) -> None:
         """Nothing is under way yet."""
@@ -263,18 +281,22 @@ class ActionReviser:
         if not acts:
             options = self._clip(self.risk.effective(situation, options))
         if self.risk.trial() is None:  # most proposals are kept: this one is looked at first
-            judgement = self._judged(self.risk.judge(situation, options[:1].copy()), 1)
+            judgement = self._judged(situation, options[:1])
             if judgement.risk[0] <= self.tolerance * (_RELEASE if self.refuses else 1.0):
                 self.refuses = False
                 return Search(options[:1], judgement, 0, _KEPT)
-        judgement = self._judged(self.risk.judge(situation, options.copy()), len(options))
+        judgement = self._judged(situation, options)
         return Search(options, judgement, *self._decide(situation, options, judgement, acts))
 
     def _clip(self, options: Floats) -> Floats:
         """What a judge made of options, put at the edge of the set where it lies outside."""
         return np.minimum(np.maximum(options, self._low), self._high)
 
-    def _judged(self, judgement: Judgement, count: int) -> Judgement:
+    def _judged(self, situation: Situation, options: Floats) -> Judgement:
+        """What the judge says of options, of which it gets a copy: it may work in place."""
+        return self._fit(self.risk.judge(situation, options.copy()), len(options))
+
+    def _fit(self, judgement: Judgement, count: int) -> Judgement:
         """What the judge said, if it is a judgement of so many options."""
         risk = np.asarray(getattr(judgement, "risk", None), np.float64)
         is_fit = risk.shape == (count,) and len(judgement.low) == len(judgement.high) == count
@@ -288,7 +310,7 @@ class ActionReviser:
         """What a judge found that looks for an action itself, if that may be executed."""
         try:
             options = self._clip(search.options)
-            judgement, best = self._judged(search.judged, len(options)), operator.index(search.best)
+            judgement, best = self._fit(search.judged, len(options)), operator.index(search.best)
             is_usable_one = best >= 0 and is_usable(self.actions, options[best], mask)
             if is_usable_one and same_action(options[0], wanted):
                 self.refuses = best != 0

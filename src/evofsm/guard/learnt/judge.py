@@ -23,7 +23,7 @@ from evofsm.fsm.kernels import COMPILES, announce_compiling
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.proportions import binomial_bounds, poisson_bounds
 from evofsm.fsm.sharing import Rollback
-from evofsm.fsm.validation import action_name, function, positive, whole
+from evofsm.fsm.validation import action_name, ask, function, positive, whole
 from evofsm.guard.actions import ActionSet, BoxActions, Choices, Mask, limits
 from evofsm.guard.api import (
     Fallback,
@@ -164,7 +164,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         for name, values in (("names", names), ("units", units)):
             if isinstance(values, str) or not all(isinstance(text, str) for text in texts[name]):
                 raise TypeError(f"{name} is {values!r}; it must be a text for each variable")
-        self.labels = Labels(names=texts["names"], units=texts["units"], dt=self.dt)
+        self.labels = Labels(None, **texts, dt=self.dt)
         #: Number of actions; 0 where the action is a box.
         self.choices = 0 if n_actions is None else whole("n_actions", n_actions)
         if {low is None, high is None} != {n_actions is not None}:
@@ -513,7 +513,8 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         def model(z: Floats, inner: Floats) -> Floats:
             assert move is not None
             action = self.decode(inner)
-            after = _answer("model", move, z, action if len(action) > 1 else action[0])
+            inputs = z, action if len(action) > 1 else action[0]
+            after = ask("model", move, _numbers, *inputs)
             if after.shape != (m,) or not np.isfinite(after).all():
                 fault = f"model gave {after} after {z} and {action}"
                 raise ValueError(f"{fault}; it has to give {m} finite numbers")
@@ -521,7 +522,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
 
         def backup(z: Floats) -> Floats:
             assert act is not None
-            action = np.atleast_1d(_answer("backup", act, z))
+            action = np.atleast_1d(ask("backup", act, _numbers, z))
             if action.shape != ((1,) if self.choices else (self.size,)) or np.isnan(action).any():
                 raise ValueError(f"backup gave {action} at {z}; it has to give an action")
             return self.encode(action[0] if self.choices else np.clip(action, self.low, self.high))
@@ -640,14 +641,8 @@ class LearntRisk(ObservingJudge, SearchingJudge):
         return f"{type(self).__name__}(dt={self.dt:g}, seed={self.seed})"
 
 
-def _answer(name: str, function: Callable[..., ArrayLike], z: Floats, *action: Any) -> Floats:
-    """What a given function says, as numbers."""
-    try:
-        return np.array(function(z.copy(), *action), np.float64)
-    except Exception as error:
-        place = ", ".join(map(str, (z, *action)))
-        error.add_note(f"{name} was asked of {place}, near what was observed")
-        raise
+def _numbers(answer: ArrayLike) -> Floats:
+    return np.array(answer, np.float64)
 
 
 def _unjudged(count: int) -> Judgement:

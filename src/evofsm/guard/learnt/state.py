@@ -20,7 +20,9 @@ Move = Callable[[Floats, Floats], Floats]
 # What files hold of a field: observations, what is not negative, and ends that may be infinite.
 _SEEN, _ABOVE_0 = Numbers(least=-1e30, most=1e30), Numbers(least=0.0)
 _BOUNDS = Numbers(least=-np.inf, most=np.inf)
-# Settings of which 0 would be none left to draw from, or to divide by; and numbers of steps.
+# Settings, of some of which 0 would be none left to draw from, or to divide by; numbers of steps.
+_Count = Annotated[int, COUNT._replace(most=1e6)]
+_Real = Annotated[float, _ABOVE_0]
 _Some = Annotated[int, FROM_1._replace(most=1e6)]
 _Size = Annotated[float, SIZE]
 _Steps = Annotated[int, FROM_1._replace(most=1e4)]
@@ -34,57 +36,57 @@ class LearntSettings:
     given of. A ValueError names one that cannot be.
     """
 
-    n_disturbances: int = 10  #: disturbances that are remembered
+    n_disturbances: _Count = 10  #: disturbances that are remembered
     n_situations: _Some = 32  #: situations on which disturbances and backups are tried
     n_asked: _Some = 3  #: backups that are asked in a decision; of more than 12 variables 2
-    n_linear: int = 3  #: linear backups
-    n_mutants: int = 40  #: backups that are tried after an episode
-    n_regulators: int = 4  #: and those beside them where actions are a box
+    n_linear: _Count = 3  #: linear backups
+    n_mutants: _Count = 40  #: backups that are tried after an episode
+    n_regulators: _Count = 4  #: and those beside them where actions are a box
     n_starts: _Some = 100  #: steps of an episode in which a disturbance may begin, at most
     max_failures: _Some = 200  #: observations in which it failed, of which it is learnt
     max_survived: _Some = 8000  #: and that were survived: of more every second one is left out
-    margin: float = 3.0  #: what has to be left of the distance to failure at first [typical steps]
-    margin_max: float = 8.0  #: and at most
-    margin_fade: float = 0.9  #: the share of the margin that is left an episode later
+    margin: _Real = 3.0  #: what has to be left of the distance to failure at first [typical steps]
+    margin_max: _Real = 8.0  #: and at most
+    margin_fade: _Real = 0.9  #: the share of the margin that is left an episode later
     #: what a violated certificate adds to it, and the least margin [typical steps] ...
-    margin_step: float = 0.25
+    margin_step: _Real = 0.25
     #: ... for which share of decisions (adaptive conformal inference, Gibbs & Candes 2021)
-    violation_rate: float = 0.001
+    violation_rate: _Real = 0.001
     #: how much harder disturbances are taken to be than they were, over the number of episodes ...
-    caution: float = 4.0
-    caution_max: float = 2.0  #: ... by so much at most, at first
+    caution: _Real = 4.0
+    caution_max: _Real = 2.0  #: ... by so much at most, at first
     #: and after the system changed: a change half as large again as any there was has no sequel
-    caution_again: float = 0.44
+    caution_again: _Real = 0.44
     horizon: _Steps = 64  #: how far it looks ahead at first [steps]
     horizon_min: _Steps = 32  #: at least
     horizon_max: _Steps = 144  #: at most
     ahead: _Size = 1.5  #: it looks so many times as far as it takes to fail
     latest: _Size = 0.98  #: of the time that it takes to fail, what is left an episode later
-    refuted: float = 0.8  #: and after one that went on from where nothing seemed to help
-    tries: int = 8  #: an action that was used less often is tried ...
-    alike: float = 0.02  #: ... where backups are alike up to such a share of the horizon
-    prior: float = 0.01  #: by how many observations weights are held to 0
-    shy: float = 20.0  #: and those of bends and products
-    lags: float = 10.0  #: so many times more those of the latest change and the action before
+    refuted: _Real = 0.8  #: and after one that went on from where nothing seemed to help
+    tries: _Count = 8  #: an action that was used less often is tried ...
+    alike: _Real = 0.02  #: ... where backups are alike up to such a share of the horizon
+    prior: _Real = 0.01  #: by how many observations weights are held to 0
+    shy: _Real = 20.0  #: and those of bends and products
+    lags: _Real = 10.0  #: so many times more those of the latest change and the action before
     #: which are left out from so much on that was missed more with them where failures that they
     #: foresaw did not come [ln(1 + square in typical steps)]
-    misled: float = 1.0
-    outlier: float = 4.0  #: from so many scales on residuals weigh less (Huber 1964)
-    rare: int = 30  #: but not of an action at an end of its range that was used less often
-    drift: float = 30.0  #: gained log likelihood from which on it moves otherwise (Page 1954)
+    misled: _Real = 1.0
+    outlier: _Real = 4.0  #: from so many scales on residuals weigh less (Huber 1964)
+    rare: _Count = 30  #: but not of an action at an end of its range that was used less often
+    drift: _Real = 30.0  #: gained log likelihood from which on it moves otherwise (Page 1954)
     #: of the latest episodes, what is left an episode later; of ``misled`` after one that failed
     #: and in most of which nothing seemed to help
-    drift_fade: float = 0.95
-    refused: float = 0.1  #: forms that refuse more than this share of proposals ...
+    drift_fade: _Real = 0.95
+    refused: _Real = 0.1  #: forms that refuse more than this share of proposals ...
     #: ... in so many episodes without failure are doubted: a rival is tried while it learns
-    patience: int = 6
-    again: int = 2  #: so many times as late each time that this was wrong
+    patience: _Count = 6
+    again: _Count = 2  #: so many times as late each time that this was wrong
     #: episodes without failure from which on a rival that was tried counts frozen, too; so long
     #: thresholds count, frozen, that fewer forms took the place of
-    settled: int = 20
-    longer: float = 0.002  #: share of the horizon that who takes over has to last longer
-    work: float = 7e6  #: products in the rollouts of a decision at most
-    work_rate: float = 8.75e8  #: and in a second of the interval
+    settled: _Count = 20
+    longer: _Real = 0.002  #: share of the horizon that who takes over has to last longer
+    work: _Real = 7e6  #: products in the rollouts of a decision at most
+    work_rate: _Real = 8.75e8  #: and in a second of the interval
 
     def __post_init__(self) -> None:
         for name, numbers in KIND.settings["settings"].items():
@@ -376,7 +378,6 @@ _FIELDS = {
     for name, hint in get_type_hints(State, include_extras=True).items()
     if name != "settings"  # they stand beside it
 }
-_SETTING = {int: COUNT._replace(most=1e6), float: _ABOVE_0}
 _HINTS = get_type_hints(LearntSettings, include_extras=True).items()
 KIND = Kind(
     "learntrisk",
@@ -389,7 +390,7 @@ KIND = Kind(
         "seed": COUNT,
         **dict.fromkeys(("names", "units"), list[str]),
         "harm": SETTINGS,
-        "settings": {name: _SETTING.get(kind) or get_args(kind)[1] for name, kind in _HINTS},
+        "settings": {name: get_args(hint)[1] for name, hint in _HINTS},
     },
 )
 
