@@ -400,7 +400,7 @@ class Guarding:
         car.wish = self._seeing.wish(car.id, speed, car.around[0])
         most = car.limit + _COARSE * self._seeing.dt
         is_safe = car.wish <= most or self._is_exactly_safe(car, speed)
-        if is_safe and not self._seeing.body(car.id).late:
+        if is_safe and not car.body.late:
             self._hand_back(car)  # it drives as it would by itself, with its imperfections
             return
         if car.mode is None:
@@ -448,8 +448,7 @@ class Guarding:
 
         Who keeps less time than a step (``tau``) drives into others, as SUMO warns, if they dawdle.
         """
-        judge, ahead, dt = _judge(car.guard), car.around[0], self._seeing.dt
-        body = self._seeing.body(car.id)
+        judge, ahead, dt, body = _judge(car.guard), car.around[0], self._seeing.dt, car.body
         if not (isinstance(judge, TrafficRisk) and ahead and ahead.most and body.tau >= dt):
             return False
         room = max(ahead.most - _further(car.wish, body.decel, self._seeing.euler), _NEAREST)

@@ -37,13 +37,13 @@ import numpy as np
 import evofsm
 from evofsm.fsm.sharing import Rollback
 from evofsm.fsm.validation import Floats
-from evofsm.guard.actions import checked_mask, written
+from evofsm.guard.actions import written
 from evofsm.guard.api import Proposal, Revision, Situation
 from evofsm.guard.guard import DecisionLogger, Guard
 from evofsm.guard.loop import Decision
 from evofsm.guard.parts import can_be_made_again, set_again, settings_of
 from evofsm.guard.record import RECORD
-from evofsm.guard.reviser import is_spoken
+from evofsm.guard.reviser import is_spoken, proposed
 
 _log = logging.getLogger(__name__)
 
@@ -782,8 +782,8 @@ class _Player(Recorder):
             if kind == "seen":
                 self._flush()
             else:
-                mask = checked_mask(guard.actions, content["mask"])
-                guard.revise(situation, Proposal(_numbers(content["proposed"]), mask))
+                proposal = Proposal(_numbers(content["proposed"]), content["mask"])
+                guard.revise(situation, proposed(guard.actions, proposal))
 
     def _differing(self, *contents: Mapping[str, Any]) -> tuple[Field, ...]:
         """What a log and this say otherwise of one thing."""

@@ -85,10 +85,7 @@ def _explained(state: State, *, failed: bool) -> State:
     if len(bent):  # others come with other bent forms
         sides = sides[failure.among(sides, was[are_sides])]
     rows = np.concatenate([sides, bent])
-    was_told, is_told = (
-        failure.inside(table, failures).any(0) if len(failures) else np.ones(0, bool)
-        for table in (was, rows)
-    )
+    was_told, is_told = (failure.inside(forms, failures).any(0) for forms in (was, rows))
     # Where most came by chance that takes long, and finds nothing.
     is_many = len(failures) > state.settings.settled and 2 * was_told.sum() < len(failures)
     if failed or not (is_told.all() or is_many):

@@ -47,6 +47,7 @@ NOTHING_SEEN = "not each variable was observed yet in this episode"
 BY_MODEL = "by the model alone, so its risk is not known: "
 NO_FAILURE = "no failure is known yet, so nothing is refused"
 _NONE = "no action passes by the margin"
+_NO_BACKUP = "after the proposal no backup prevents failure"
 #: What is done where all backups look alike and another action was hardly used.
 TRIED = f"{_NONE}; what this one does is hardly known, so it is tried"
 #: What is done where no backup lasts longer than the proposal.
@@ -103,9 +104,7 @@ def refused(unsurvived: int, remembered: Remembered, margin: float, scale: float
         n_failed, n = remembered.lost
         record = f"so it seemed in {counted(n, 'episode')} of late: {n_failed} failed"
         record = record if n else "how that ends was not seen yet"
-        return (
-            f"after the proposal no backup prevents failure, even if nothing disturbs it; {record}"
-        )
+        return f"{_NO_BACKUP}, even if nothing disturbs it; {record}"
     if unsurvived == 0:
         text = f"no backup survives {remembered.most} by the margin of {changes(margin)}"
         return text if scale < _HARDER else f"{text}, were they {scale:.2g} times as hard"
@@ -117,7 +116,7 @@ def refused(unsurvived: int, remembered: Remembered, margin: float, scale: float
 def alone(why: str) -> str:
     """Why it is dangerous where there is but one action, and so no backup."""
     why = why.replace("no backup survives", "it does not survive")
-    return why.replace("after the proposal no backup prevents failure", "it fails")
+    return why.replace(_NO_BACKUP, "it fails")
 
 
 def dead_ends(counts: Sequence[int]) -> str:
@@ -160,11 +159,9 @@ def no_threshold(n_failed: int, n_seen: int, n_survived: int, *, is_given: bool)
     if not n_failed:
         return NO_FAILURE
     failures = counted(n_failed, "failure")
-    if not n_seen:
-        return (
-            f"{failures}, before four observations or with NaN in the last, so nothing is refused"
-        )
-    return f"{failures} seen, but beyond no value that was survived, so nothing is refused"
+    where = " seen, but beyond no value that was survived"
+    where = where if n_seen else ", before four observations or with NaN in the last"
+    return f"{failures}{where}, so nothing is refused"
 
 
 def experience(
