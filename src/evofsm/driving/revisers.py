@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict
-from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -13,7 +12,7 @@ import numpy as np
 from evofsm.driving import measures
 from evofsm.driving.naming import LABELS
 from evofsm.fsm.actions import IntervalActions
-from evofsm.fsm.sharing import Rollback
+from evofsm.fsm.sharing import Rollback, as_now
 from evofsm.fsm.validation import Floats, positive
 from evofsm.guard import Fallback, Proposal, Revision, RiskMeasure, Situation, make_usable
 from evofsm.guard.parts import part_class, part_name
@@ -52,7 +51,7 @@ class EnvelopeReviser:
 
     def savepoint(self) -> Rollback:
         """What takes back all that is seen from now on."""
-        return partial(setattr, self, "_seen", self._seen)
+        return as_now(self)
 
     def revise(self, situation: Situation, proposal: Proposal) -> Revision:
         """Full braking where the measure is above 0, else the proposal."""

@@ -65,6 +65,18 @@ def transaction(method: Method) -> Method:
     return cast(Method, done)
 
 
+def as_now(shared: Any, *lists: str) -> Rollback:
+    """What gives it the attributes of now back, and lists of these names their lengths of now."""
+    attributes, lengths = {**vars(shared)}, {name: len(getattr(shared, name)) for name in lists}
+
+    def rollback() -> None:
+        vars(shared).update(attributes)
+        for name, length in lengths.items():
+            del attributes[name][length:]
+
+    return rollback
+
+
 class Retraced:
     """What is taken back by going through its latest steps again: that costs nothing before.
 

@@ -35,7 +35,7 @@ import numba
 import numpy as np
 
 import evofsm
-from evofsm.fsm.sharing import Rollback
+from evofsm.fsm.sharing import Rollback, as_now
 from evofsm.fsm.validation import Floats
 from evofsm.guard.actions import written
 from evofsm.guard.api import Proposal, Revision, Situation
@@ -481,10 +481,10 @@ class AuditLog(Ledger, Recorder, AbstractContextManager["AuditLog"]):
 
     def savepoint(self) -> Rollback:
         """What takes back all that is logged from now on, in the file, too."""
-        attributes = {**self.__dict__}
+        take_back = as_now(self)
 
         def rollback() -> None:
-            self.__dict__.update(attributes)
+            take_back()
             with suppress(OSError):  # else before more is written
                 self._cut()
 

@@ -29,7 +29,7 @@ from evofsm import store
 from evofsm.fsm.kernels import compiled, kernel
 from evofsm.fsm.naming import Labels, in_a_line
 from evofsm.fsm.proportions import wilson_bounds
-from evofsm.fsm.sharing import Rollback
+from evofsm.fsm.sharing import Rollback, as_now
 from evofsm.fsm.validation import positive, refuse_unusable
 from evofsm.guard.actions import Action
 from evofsm.guard.api import Fallback, Judgement, LearningJudge, Search, Situation
@@ -658,13 +658,7 @@ class Foresight(LearningJudge):
 
     def savepoint(self) -> Rollback:
         """What takes back all that it learns from now on."""
-        attributes, count = {**vars(self)}, len(self._seen)
-
-        def rollback() -> None:
-            vars(self).update(attributes)
-            del self._seen[count:]
-
-        return rollback
+        return as_now(self, "_seen")
 
     def save(self, path: Place, provenance: Mapping[str, Any] | None = None) -> None:
         """Write what was learnt to a file, with what it learnt from, for people (`provenance`)."""

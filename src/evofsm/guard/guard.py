@@ -25,7 +25,7 @@ from evofsm.fsm.machine import EvolvingFSM, opened
 from evofsm.fsm.model import FSMModel
 from evofsm.fsm.naming import Labels, in_a_line
 from evofsm.fsm.rules import reach
-from evofsm.fsm.sharing import Rollback, alone, share, transaction, unshared
+from evofsm.fsm.sharing import Rollback, alone, as_now, share, transaction, unshared
 from evofsm.fsm.validation import ask, function, positive, real_array, setting, truth, usable_array
 from evofsm.guard.actions import (
     Action,
@@ -436,12 +436,11 @@ class Guard:
 
     def _savepoint(self) -> Rollback:
         """What takes back all that is done from now on."""
-        attributes = {**vars(self)}
         parts: Any = self.machine, self.judge, self.reviser, self.audit
         rollbacks = [part.savepoint() for part in parts if hasattr(part, "savepoint")]
+        rollbacks.append(as_now(self))
 
         def rollback() -> None:
-            vars(self).update(attributes)
             for take_back in rollbacks:
                 take_back()
 

@@ -22,7 +22,7 @@ from evofsm import store
 from evofsm.fsm.kernels import COMPILES, announce_compiling
 from evofsm.fsm.naming import Labels
 from evofsm.fsm.proportions import binomial_bounds, poisson_bounds
-from evofsm.fsm.sharing import Rollback
+from evofsm.fsm.sharing import Rollback, as_now
 from evofsm.fsm.validation import action_name, ask, function, positive, whole
 from evofsm.guard.actions import ActionSet, BoxActions, Choices, Mask, limits
 from evofsm.guard.api import (
@@ -442,15 +442,7 @@ class LearntRisk(ObservingJudge, SearchingJudge):
 
     def savepoint(self) -> Rollback:
         """What takes back all that it learns from now on."""
-        fields = {**self.__dict__}
-        lengths = {name: len(fields[name]) for name in ("_z", "_u", "_notes")}
-
-        def rollback() -> None:
-            self.__dict__ = {**fields}
-            for name, length in lengths.items():
-                del self.__dict__[name][length:]
-
-        return rollback
+        return as_now(self, "_z", "_u", "_notes")
 
     def observe(self, observation: Floats) -> None:
         """Take in an observation, NaN where something was not seen; a ValueError if too long."""
