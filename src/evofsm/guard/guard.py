@@ -322,10 +322,9 @@ class Guard:
         self.actions = reviser.actions
         self._interval = positive("interval", interval)
         action_judge: Any = getattr(reviser, "risk", judge)
-        if judge is None and isinstance(action_judge, LearningJudge):
-            judge = action_judge
-        elif judge is None and hasattr(action_judge, "learn"):
+        if judge is None and hasattr(action_judge, "learn"):
             refuse_lacking("judge that learns", action_judge)
+            judge = action_judge
         for part, of in (("judge", judge), ("reviser", reviser)):
             dt = getattr(of, "dt", None) or self.interval
             if not math.isclose(dt, self.interval):

@@ -85,11 +85,11 @@ def proposed(actions: ActionSet, reply: Proposal | ArrayLike | None) -> Proposal
         action = no_action(actions)
     elif isinstance(actions, BoxActions):
         action = actions.checked("proposal", action)
-    elif isinstance(action, np.ndarray | list):  # of one number, as policies predict it
-        if np.size(action) != 1:
-            raise ValueError(f"proposal has {np.size(action)} numbers; it must be a single one")
-        action = np.ravel(action)[0]
-    if not isinstance(actions, BoxActions) and type(action) is not float:
+    elif type(action) is not float:
+        if isinstance(action, np.ndarray | list):  # of one number, as policies predict it
+            if np.size(action) != 1:
+                raise ValueError(f"proposal has {np.size(action)} numbers; it must be a single one")
+            action = np.ravel(action)[0]
         action = number("proposal", action)
     return Proposal(action, checked_mask(actions, mask))
 
