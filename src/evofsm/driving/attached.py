@@ -119,7 +119,7 @@ class Seeing:
         self._bodies: dict[str, _Facts] = {}
         try:
             sumo.simulation.getTime()
-        except _no_simulation(sumo) as error:
+        except _module(sumo).FatalTraCIError as error:
             raise ValueError("no simulation of SUMO runs; start one, then attach") from error
         self.look_up()
 
@@ -267,10 +267,9 @@ class _Car:
         return float(min(self.body.accel, high))
 
 
-def _no_simulation(sumo: Any) -> type[Exception]:
-    """What is raised where none runs; a connection of traci does not have it."""
-    module = sumo if hasattr(sumo, "FatalTraCIError") else import_module("traci")
-    return module.FatalTraCIError  # type: ignore[no-any-return]
+def _module(sumo: Any) -> Any:
+    """Where its classes are: a connection of traci has none, such as for where none runs."""
+    return sumo if hasattr(sumo, "FatalTraCIError") else import_module("traci")
 
 
 def _further(speed: float, decel: float, euler: float) -> float:
@@ -654,14 +653,13 @@ class Attachment:
 
     def listen(self) -> None:
         """Have SUMO call `step` after each of its own."""
-        base = getattr(self._sumo, "StepListener", None) or import_module("traci").StepListener
         if getattr(self._sumo, "__name__", "") == "libsumo":
             # It keeps listeners where a simulation is closed. Whoever attaches anew is not guarded
             # twice, once by what was attached to the one before.
             for stale in [a for a in _ATTACHED if a._sumo is self._sumo and a._is_new()]:
                 stale._listen_no_more()
         does = {"step": lambda *_: self.step(), "cleanUp": lambda *_: self._is_removed()}
-        listener = type("Listener", (base,), does)()
+        listener = type("Listener", (_module(self._sumo).StepListener,), does)()
         self._listener = self._sumo.addStepListener(listener)
         self._sumo.simulation.setParameter("", self._key, "1")
         _ATTACHED.add(self)
@@ -754,7 +752,7 @@ class Attachment:
         """Whether another simulation runs than it was attached to, or none."""
         try:
             return bool(self._sumo.simulation.getParameter("", self._key) != "1")
-        except _no_simulation(self._sumo):
+        except _module(self._sumo).FatalTraCIError:
             return True
 
     def _begin_anew(self) -> None:

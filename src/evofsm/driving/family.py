@@ -247,8 +247,6 @@ def held_out(family: Family, seed: int, episodes: int) -> list[Draw]:
 
 
 # The sizes are our own: what a production radar and brake system roughly show.
-
-
 #: What can be switched on in any family, by name: what of a part of its scenarios is changed, to
 #: which values, and to values that are drawn from which ranges.
 SWITCHES: Mapping[str, tuple[str, dict[str, float], dict[str, tuple[float, float]]]] = {

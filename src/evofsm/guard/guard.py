@@ -366,9 +366,13 @@ class Guard:
 
     mode = _of_reviser("mode", "How far its reviser goes, a `Mode`; may be changed at any time.")
     tolerance = _of_reviser("tolerance", "Highest risk that its reviser accepts, in (0, 1).")
-    explaining = setting("explaining", truth, "Whether experience is said of each decision.")
-    shadow = setting("shadow", truth, "Whether proposals pass where it was not shown to help.")
-    interval = property(attrgetter("_interval"), doc="Time between two decisions [s].")
+    explaining: bool = setting("explaining", truth, "Whether experience is said of each decision.")
+    shadow: bool = setting("shadow", truth, "Whether proposals pass where it is in doubt.")
+
+    @property
+    def interval(self) -> float:
+        """Time between two decisions [s], of which all that it learns is."""
+        return self._interval
 
     @property
     def failed(self) -> Callable[[NDArray[np.float64]], bool] | None:

@@ -78,7 +78,7 @@ class RevisedAgents(gym._Settled, BaseParallelWrapper[Any, Any, Any]):  # type: 
             lane.end(failed=False)
             lane.is_open = False
         observations, infos = parts_of(self.env.reset(seed=seed, options=options))
-        infos = _whole(infos)
+        infos = {agent: infos[agent] or {} for agent in infos}
         self._begin(observations, infos)
         return observations, infos
 
@@ -87,7 +87,7 @@ class RevisedAgents(gym._Settled, BaseParallelWrapper[Any, Any, Any]):  # type: 
         decisions = {agent: self._enter(agent).decide(action) for agent, action in actions.items()}
         executed = {agent: decision.executed for agent, decision in decisions.items()}
         observations, rewards, terminated, truncated, infos = parts_of(self.env.step(executed), 5)
-        infos, rewards = _whole(infos), dict(rewards)
+        infos, rewards = {agent: infos[agent] or {} for agent in infos}, dict(rewards)
         alive, steps = {*self.env.agents}, dict[Any, StepResult]()
         for agent in (agent for agent, lane in self._lanes.items() if lane.is_open):
             is_over, has_left = bool(terminated.get(agent)), agent not in alive
@@ -130,8 +130,3 @@ class RevisedAgents(gym._Settled, BaseParallelWrapper[Any, Any, Any]):  # type: 
             spaces = self.env.observation_space(agent), self.env.action_space(agent)
             self._lanes[agent] = Lane(self._terms(*spaces), shared=True)
         return self._lanes[agent]
-
-
-def _whole(infos: _Each) -> _Each:
-    """The info of each agent, {} for None."""
-    return {agent: info or {} for agent, info in infos.items()}

@@ -210,10 +210,8 @@ class ActionReviser:
         self._far, self._clipped = _CLEARLY * (self._high - self._low), 0
         self.start_episode()
 
-    mode = setting(
-        "mode", lambda _, mode: Mode(mode), "How far it goes; may be changed at any time."
-    )
-    tolerance = setting("tolerance", probability, "Highest latent risk that is accepted.")
+    mode: Mode = setting("mode", lambda _, mode: Mode(mode), "How far it goes.")
+    tolerance: float = setting("tolerance", probability, "Highest latent risk that is accepted.")
 
     def start_episode(self) -> None:
         """Nothing is under way yet."""
