@@ -130,9 +130,12 @@ def test_where_drivers_keep_their_distance_guards_do_no_harm(road, step, options
         assert cars.summary().get("limited", 0) == 0  # nobody had to brake hard until now
         sumo.vehicle.setMaxSpeed("lead", 3.0)
         drive(sumo, 40.0, brakes_at=np.inf)
+        sumo.vehicle.setSpeed("lead", 0.0)
+        drive(sumo, 40.0, brakes_at=np.inf)  # they come up to it, and creep on to `minGap`
         found.append(cars.summary())
         cars.detach()
     alone, guarded = found
+    assert guarded["revised"] == 0
     assert guarded["collisions"] == alone["collisions"] == 0
     assert guarded["hard_brakes"] <= alone["hard_brakes"] + 1
     assert guarded["speed"] >= 0.995 * alone["speed"]

@@ -91,7 +91,7 @@ class Neighbour(NamedTuple):
     gap: float  #: from bumper to bumper [m]
     room: float  #: what is left of it until SUMO counts a collision, in its step [m]
     speed: float  #: [m/s]
-    most: float = 0.0  #: the same, if the follower stands after whole steps [m]; 0: not asked
+    most: float  #: the same, if the follower stands after whole steps [m]
 
 
 class _Facts(NamedTuple):
@@ -198,8 +198,7 @@ class Seeing:
         spare_gap = (1.0 - self._factor) * follower.min_gap if gap else 0.0
         room = gap + spare_gap + 0.5 * euler * (v_follower - v_leader)
         late = 0.125 * follower.decel * euler * euler  # at most, whatever the follower does
-        coarse = 0.125 * follower.decel * self.dt * self.dt >= _MARGIN
-        most = room + _further(v_leader, leader.decel, euler) if coarse else 0.0
+        most = room + _further(v_leader, leader.decel, euler)
         return Neighbour(neighbour, gap + follower.min_gap, max(room - late, _NEAREST), v, most)
 
     def wish(self, car: str, speed: float, ahead: Neighbour | None) -> float:
@@ -448,7 +447,7 @@ class Guarding:
         Who keeps less time than a step (``tau``) drives into others, as SUMO warns, if they dawdle.
         """
         judge, ahead, dt, body = _judge(car.guard), car.around[0], self._seeing.dt, car.body
-        if not (isinstance(judge, TrafficRisk) and ahead and ahead.most and body.tau >= dt):
+        if not (isinstance(judge, TrafficRisk) and ahead and body.tau >= dt):
             return False
         room = max(ahead.most - _further(car.wish, body.decel, self._seeing.euler), _NEAREST)
         # It may use up the margin, as SUMO's models do.
