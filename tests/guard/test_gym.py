@@ -427,6 +427,21 @@ def test_a_list_of_infos_is_made_above_the_guard_and_statistics_that_change_no_m
     RevisedActions(wrappers.NormalizeReward(cart()), guard_for(Discrete(2)))  # nobody looks at it
 
 
+def test_an_environment_is_not_put_under_one_guard_twice():
+    guard, said = guard_for(Discrete(2)), "under this guard already.*make it anew"
+    one = wrappers.TimeLimit(RevisedActions(cart(), guard), 9)
+    many = RevisedVectorActions(SyncVectorEnv([cart]), guard)
+    agents = RevisedAgents(Crowd(2), runners := guard_for(ONE))
+    with pytest.raises(ValueError, match=said):
+        RevisedActions(one, guard)
+    for envs in (many, SyncVectorEnv([lambda: one])):
+        with pytest.raises(ValueError, match=said):
+            RevisedVectorActions(envs, guard)
+    with pytest.raises(ValueError, match=said):
+        RevisedAgents(agents, runners)
+    RevisedActions(one, guard_for(Discrete(2)))  # another one may look at what is left
+
+
 def test_a_guard_that_is_narrower_than_the_environment_is_told_of_and_in_shadow_changes_nothing():
     env, guard = Script(FAR, FAR), Guard(low=-1.0, high=1.0, interval=0.1, mode=Mode.SHADOW)
     with pytest.warns(UserWarning, match=r"go from -1\.0 to 1\.0, .* put at its edge") as told:

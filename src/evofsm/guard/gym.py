@@ -683,6 +683,9 @@ def warn_of(env: Any, guard: Guard, failed: Failed | None) -> None:
             stacklevel=3,
         )
     for layer in _layers(env):
+        if isinstance(layer, _Settled) and layer.guard is guard:
+            hint = "make it anew, or wrap what is below (was a cell of a notebook run again?)"
+            raise ValueError(f"the environment is under this guard already, twice it errs: {hint}")
         attributes, why = getattr(layer, "__dict__", {}), ""
         # SuperSuit has one wrapper, for each agent's modifier or for the only one.
         kinds = attributes.get("modifier_class"), type(attributes.get("modifier"))
