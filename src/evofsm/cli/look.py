@@ -52,6 +52,12 @@ _FAILURE = re.compile(
     "st(ö|oe)r|(?<!de)fault|fail|trip|alarm|error|fehler|defek|ausfall|crash|colli|not-?aus|emerg",
     re.IGNORECASE,
 )
+# How well it went: no failure, and nothing that a live row has before it acts.
+_OUTCOME = re.compile(
+    r"(is_?)?success(ful)?|(goal_?)?reached(_goal)?|goal|solved|(timelimit\.)?truncated|time_?out|"
+    "reward|return|next_.*",
+    re.IGNORECASE,
+)
 _TRUTH = re.compile("true|false|yes|no|ja|nein|wahr|falsch|", re.IGNORECASE)
 _TAG = re.compile("(^|_)tag|signal|sensor|variab|channel|kanal|param|messst|name|entity", re.I)
 _WHO = re.compile("ma(sch|ch)ine|device|ger(ä|ae)t|asset|unit|anlage|pump|motor|(^|_)id$", re.I)
@@ -78,7 +84,8 @@ def show_look(files: Sequence[str], table: CsvTable | ParquetTable) -> None:
     if before and len(files) == 1:
         kind = "csv" if isinstance(table, CsvTable) else "parquet"
         mark, how = f", separator={table.separator!r}" * (kind == "csv"), ", infer_schema=False"
-        files = [f"{Path(file).name.partition('.')[0]}-sorted.{kind}"]
+        done = "sorted" if "run=" not in before else "runs"
+        files = [f"{Path(file).name.partition('.')[0]}-{done}.{kind}"]
         read = f"p.read_{kind}({file!r}{mark}{how * bool(mark)})"
         code = f"{read}{before}.write_{kind}({files[0]!r}{mark})"
         print(f"  python -c {in_quotes(f'import polars as p; {code}')}")
@@ -105,7 +112,8 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     runs, still = np.ones(len(frame), np.bool_), next((n for n in values if _stands(values[n])), "")
     limit = _round(0.1 * float(np.nanquantile(np.abs(values[still]), 0.95))) if still else 0.0
     runs = values[still] > limit if still else runs
-    rare = [*_rare(frame, [name for name in (*texts, *values) if name not in USUAL_EPISODE])]
+    outcomes = [name for name in (*texts, *values) if _OUTCOME.fullmatch(name)]
+    rare = [*_rare(frame, [n for n in (*texts, *values) if n not in {*USUAL_EPISODE, *outcomes}])]
     likely = [row for row in rare if _FAILURE.search(row[1])]
     kinds = {name: frame[name].unique().to_list() for name in texts}
     truths = {name for name in texts if all(map(_TRUTH.fullmatch, kinds[name]))}
@@ -114,9 +122,12 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     rare = likely or marks or [row for row in rare if row[0] in remarks and len(row[-1]) > 1]
     markers = {name for name, *_ in rare}  # which do not tell episodes apart
     groups = [name for name in (*USUAL_EPISODE, *texts, *values) if name in frame.columns]
-    groups = [name for name in groups if name not in markers and not _FAILURE.search(name)]
+    groups = [n for n in groups if n not in {*markers, *outcomes} and not _FAILURE.search(n)]
     group, order = _episodes(frame, clock, groups)
     segments = _numbered(frame[group])[order] if group else np.zeros(len(frame))
+    is_count = bool(clock) and not group and table.holds(clock) == "number"
+    begins = _begins_anew(frame[clock].to_numpy()) if is_count else None
+    segments = segments if begins is None else np.cumsum(begins)
     places, is_mixed = np.argsort(order), bool((np.diff(order) != 1).any())
     ends = [np.append(np.flatnonzero(np.diff(segments)), -1)]
     ends += [places[rows] for *_, rows in rare[:1]]
@@ -146,7 +157,7 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     options += [("--unit", form)] if form and not counts else []
     bad = sum(n for kind, (n, _) in skips.items() if kind != "letter") + sum(odd.values())
     if not counts:
-        at = frame[clock].to_numpy()[order]
+        at, kept = frame[clock].to_numpy()[order], np.ones(len(frame), np.bool_)
         there = {name: np.isfinite(z[order]) for name, z in values.items()}
         there = {name: rows for name, rows in there.items() if rows.sum() > _MANY}
         if there and not np.logical_and.reduce([*there.values()]).any():  # of several clocks
@@ -154,8 +165,8 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
             hold = next((nice for nice, _ in _NICE if nice >= 3.0 * age), _NICE[-1][0])
             options.append(("--hold", f"{hold:g}"))
             rows = there[next(filter(_is_set, there), next(iter(there)))]
-            at, segments, n_partial = at[rows], segments[rows], 0
-        further, n_late = _of_steps(at, segments, facts, n_partial)
+            at, kept, n_partial = at[rows], rows, 0
+        further, n_late = _of_steps(at, segments[kept], facts, n_partial)
         options, bad = options + further, bad + n_late
     bad = max(bad, n_partial * ("--resample" not in dict(options)))  # there they cost nothing else
     if bad > max(SKIPPED, _MANY_BAD * len(frame)):
@@ -175,19 +186,34 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     facts += [("a failure?", f"{text} {frequency}") for _, text, frequency, _ in rare]
     untold = "no column tells of one; docs/logs.md makes one of times, or of the last rows of runs"
     facts += [] if rare else [("a failure?", untold)]
+    if rare and 1 < len(rare[0][-1]) == len({*segments.tolist()}):
+        facts.append(("", "all episodes end so: if some end well, another condition has to say it"))
+    if outcomes:
+        facts.append(("left out", f"{', '.join(outcomes)}: how well it went, not where it fails"))
     options += [("--failed", text) for _, text, *_ in rare[:1]]
+    before = f".sort({group!r}, maintain_order=True)" if group else ".reverse()"
+    if begins is not None:
+        facts.append(("an episode?", f"where {clock} begins anew: number these runs, as below"))
+        options.append(("--episode", "run"))
+        falls = f"(p.col({clock!r}).cast(float).diff() < 0).fill_null(False)"
+        before = f".with_columns(run={falls}.cum_sum())"
     if group:
         mend = f", but mixed: sort rows by {group} and then by {clock} first, as below"
         facts.append(("an episode?", f"each {group}{mend if is_mixed else ''}"))
         options.append(("--episode", _named(group, ",")))
-    before = f".sort({group!r}, maintain_order=True)" if group else ".reverse()"
-    spans = {n: z[runs] for n, z in values.items() if n not in {group, *markers}}
+    labels = {n for n, z in values.items() if _FAILURE.search(n) and {*np.unique(z)} == {0.0, 1.0}}
+    others = {group, *markers, *labels, *outcomes}
+    spans = {n: z[runs] for n, z in values.items() if n not in others}
     spans = {n: np.nanquantile(z, (0.02, 0.98)) for n, z in spans.items()}
     if still in spans and spans[still][1] < 1.05 * spans[still][0]:  # it is always the same
         del spans[still]
-    moves = {n: np.diff(values[n][order][np.isfinite(values[n][order])]) for n in spans}
-    # What goes on by the same from row to row is a count of them.
-    steady = {n: e.tolist() for n, e in spans.items() if e[1] > e[0] and np.ptp(moves[n])}
+    series = {n: values[n][order] for n in spans}
+    there = {n: np.isfinite(z) for n, z in series.items()}
+    moves = {n: np.diff(z[there[n]]) for n, z in series.items()}
+    # What goes on by the same from row to row of an episode is a count of them.
+    goes_on = {n: np.diff(segments[there[n]]) == 0.0 for n in spans}
+    tallies = {n for n, steps in moves.items() if len({*steps[goes_on[n]].tolist()}) < 2}
+    steady = {n: e.tolist() for n, e in spans.items() if e[1] > e[0] and n not in tallies}
     one_way = [n for n in steady if len(last) > 2 and len(set(np.sign(moves[n])) - {0.0}) == 1]
     if one_way and len(one_way) < len(steady):
         facts.append(("left out", f"{', '.join(one_way)}: never comes back, as an odometer"))
@@ -200,7 +226,8 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
         if units[n] and not table.units.get(n):
             options.append(("--unit", f"{_named(n, '=')}={units[n]}"))
     levels = np.unique(values[action][np.isfinite(values[action])]) if action else np.zeros(0)
-    return facts, _of_numbers(steady, action, levels, options), before if is_mixed else ""
+    is_whole = begins is None and not is_mixed
+    return facts, _of_numbers(steady, action, levels, options), "" if is_whole else before
 
 
 def _first_rows(
@@ -335,6 +362,15 @@ def _forms(text: str) -> list[str]:
     hour += ":%S" * bool(has_seconds) + ".%f" * bool(has_parts) + " %p" * bool(half)
     days = days[:: -1 if half else 1]  # who writes AM has the month first
     return [sign.join(day) + hour for day in days]
+
+
+def _begins_anew(at: Floats) -> NDArray[np.bool_] | None:
+    """(n,) where a clock falls back to where it began, if it does, and nowhere else."""
+    steps = np.diff(at, prepend=at[:1])
+    falls = steps < 0.0
+    begins = np.abs(at - at[0]) <= 3.0 * np.median(np.abs(steps))
+    lengths = np.diff([0, *np.flatnonzero(falls), len(at)])
+    return falls if begins[falls].all() and len(at) > lengths.min() >= _MANY else None
 
 
 def _odd(steps: Floats) -> NDArray[np.bool_]:
@@ -497,6 +533,7 @@ def _range(name: str, z: Floats, runs: NDArray[np.bool_], ends: Rows) -> str:
 def _told(texts: polars.Series) -> str:
     """The texts of a column, in words."""
     if (n := texts.n_unique()) > _MOST_TEXTS:
-        return f"{n:,} different texts, such as {texts[0]!r}"
+        lists = "; make a column of each number in it" * str(texts[0]).startswith("[")
+        return f"{n:,} different texts, such as {texts[0]!r}{lists}"
     counts = texts.value_counts(sort=True, name="rows").rows()
     return ", ".join(f"{text or 'nothing'} {n / len(texts):.2%}" for text, n in counts)
