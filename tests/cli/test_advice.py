@@ -175,6 +175,30 @@ def test_what_a_first_look_proposes_reads_all_rows(evofsm, names):
     assert "1 episode ended with f==True" in found
 
 
+def test_a_first_look_takes_no_good_ending_for_a_failure_and_observes_no_outcome(evofsm, refused):
+    rows = ["run,step,level,reward,next_level,success,terminated,failed"]
+    for run in range(24):
+        for k in range(n := 20 + run % 5):
+            level, ends = k / 9 * (run % 2) + k % 3 + run % 4, int(k + 1 == n)
+            bad = run % 2 * ends
+            rows.append(f"{run},{k},{level:.2f},{-bad},{level},{ends - bad},{bad},{run % 2}")
+    Path("gym.csv").write_text("\n".join(rows))
+    found = " ".join(evofsm("learn", "gym.csv").stdout.split())
+    assert "left out reward, next_level, success: how well it went" in found
+    assert "--observe level " in found  # nor the label of whole runs, nor a count of rows
+    assert "--failed terminated==1 " in found
+    asked = "learn", "gym.csv", "--observe", "level", "--action", "", "--dt", 1, "--episode", "run"
+    assert "does --failed mark all rows of an" in evofsm(*asked, "--failed", "failed").stderr
+    assert "does --failed say the reverse?" in refused(*asked, "--failed", "level>-1")
+    text = "\n".join(row.partition(",")[2] for row in rows)  # which tells no runs
+    Path("bare.csv").write_text(text.replace("step", "time", 1))
+    looked = evofsm("learn", "bare.csv").stdout
+    before, _, command = looked.partition("to learn from it:\n")[2].rpartition("  evofsm ")
+    shell(before.strip())
+    learnt = evofsm(*shlex.split(command.replace("\\\n", "")))
+    assert "12 episodes ended with terminated==1" in learnt.stdout
+
+
 @pytest.mark.parametrize(
     ("field", "live"), [(" Fault ", "Fault"), ('"too hot\ntrip"', "too hot\ntrip"), ("TRUE", True)]
 )

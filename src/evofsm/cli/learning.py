@@ -102,6 +102,8 @@ def learn_traces(
     if not counts["transitions"]:
         fault = "no row with an action is followed by another row of its episode"
         cause = "is every row an episode? are the rows sorted by episode and time?"
+        if 2 * counts["failures"] > counts["episodes"]:  # which a failure ends
+            cause = "most episodes fail with their first row: does --failed say the reverse?"
         raise ValueError(f"no transition could be learnt: {fault} ({cause})")
     return Learning(model, machine, actions, counts, seconds, levels)
 
@@ -163,8 +165,12 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
         hint = f"does that stand for {missing(f'{name}=={value:g}')}"
         warnings.append(f"{share} failed episodes {fault}: {hint}")
     if noted.failed_at_once:
-        why = "what led there was not recorded, so no alarm could foresee them"
-        warnings.append(f"{share} failures came right after a hole or standstill: {why}")
+        why = "right after a hole or standstill: what led there was not recorded, so no alarm "
+        why += "could foresee them"
+        if 2 * noted.failed_at_once > noted.failed:
+            why = "with an episode's first row: does --failed mark all rows of an episode that "
+            why += "failed? Mark its last one alone. Or do holes or standstills end them?"
+        warnings.append(f"{share} failures came {why}")
     if alone := [(name, *pair) for name, pair in noted.below.items() if pair[0] and pair[1] > 2]:
         name, value, rows = min(alone, key=lambda entry: entry[1] not in _NOBODY)
         hint = f"is that {missing(f'{name}=={value!r}')}"
