@@ -84,8 +84,8 @@ def show_look(files: Sequence[str], table: CsvTable | ParquetTable) -> None:
     if before and len(files) == 1:
         kind = "csv" if isinstance(table, CsvTable) else "parquet"
         mark, how = f", separator={table.separator!r}" * (kind == "csv"), ", infer_schema=False"
-        done = "sorted" if "run=" not in before else "runs"
-        files = [f"{Path(file).name.partition('.')[0]}-{done}.{kind}"]
+        suffix = "sorted" if "run=" not in before else "runs"
+        files = [f"{Path(file).name.partition('.')[0]}-{suffix}.{kind}"]
         read = f"p.read_{kind}({file!r}{mark}{how * bool(mark)})"
         code = f"{read}{before}.write_{kind}({files[0]!r}{mark})"
         print(f"  python -c {in_quotes(f'import polars as p; {code}')}")
@@ -157,7 +157,7 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     options += [("--unit", form)] if form and not counts else []
     bad = sum(n for kind, (n, _) in skips.items() if kind != "letter") + sum(odd.values())
     if not counts:
-        at, kept = frame[clock].to_numpy()[order], np.ones(len(frame), np.bool_)
+        at, rows = frame[clock].to_numpy()[order], np.ones(len(frame), np.bool_)
         there = {name: np.isfinite(z[order]) for name, z in values.items()}
         there = {name: rows for name, rows in there.items() if rows.sum() > _MANY}
         if there and not np.logical_and.reduce([*there.values()]).any():  # of several clocks
@@ -165,8 +165,8 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
             hold = next((nice for nice, _ in _NICE if nice >= 3.0 * age), _NICE[-1][0])
             options.append(("--hold", f"{hold:g}"))
             rows = there[next(filter(_is_set, there), next(iter(there)))]
-            at, kept, n_partial = at[rows], rows, 0
-        further, n_late = _of_steps(at, segments[kept], facts, n_partial)
+            at, n_partial = at[rows], 0
+        further, n_late = _of_steps(at, segments[rows], facts, n_partial)
         options, bad = options + further, bad + n_late
     bad = max(bad, n_partial * ("--resample" not in dict(options)))  # there they cost nothing else
     if bad > max(SKIPPED, _MANY_BAD * len(frame)):
@@ -202,8 +202,8 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
         facts.append(("an episode?", f"each {group}{mend if is_mixed else ''}"))
         options.append(("--episode", _named(group, ",")))
     labels = {n for n, z in values.items() if _FAILURE.search(n) and {*np.unique(z)} == {0.0, 1.0}}
-    others = {group, *markers, *labels, *outcomes}
-    spans = {n: z[runs] for n, z in values.items() if n not in others}
+    no_variables = {group, *markers, *labels, *outcomes}
+    spans = {n: z[runs] for n, z in values.items() if n not in no_variables}
     spans = {n: np.nanquantile(z, (0.02, 0.98)) for n, z in spans.items()}
     if still in spans and spans[still][1] < 1.05 * spans[still][0]:  # it is always the same
         del spans[still]

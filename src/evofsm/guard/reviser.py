@@ -78,9 +78,14 @@ class Mode(Enum):
         raise ValueError(f"mode is {value!r}; it is one of {', '.join(m.value for m in cls)}")
 
 
-def proposed(actions: ActionSet, reply: Proposal | ArrayLike | None) -> Proposal:
-    """What a controller wants, of the right type, whatever its values; of None no action."""
+def proposed(actions: ActionSet | None, reply: Proposal | ArrayLike | None) -> Proposal:
+    """What a controller wants, of the right type, whatever its values; of None no action.
+
+    Whatever was replied, if no set is known.
+    """
     action, mask = reply if isinstance(reply, Proposal) else (reply, None)
+    if actions is None:
+        return Proposal(action)
     if action is None:
         action = no_action(actions)
     elif isinstance(actions, BoxActions):
