@@ -9,7 +9,7 @@ import os
 import re
 import signal
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
@@ -360,37 +360,34 @@ def run_configuration(
         print_json({**settings, **outcome, "alone": alone})
         return
     runs = (outcome,) if alone is None else (alone, outcome)
-    rows = [(name, *map(tell, runs)) for name, tell in _TOLD.items()]
+    rows = [(name, *(_told(came, *how) for came in runs)) for name, how in _TOLD.items()]
     rows = [row for row in rows if any(row[1:])]
     header = ("", "in shadow") if alone is None else ("", "alone", "guarded")
     show(table(f"What came of {outcome['seconds']:,.0f} s", header, rows))
 
 
-def _share(what: str) -> Callable[[Mapping[str, Any]], str]:
-    """How many of the decisions; empty where nobody decided."""
-    return lambda came: f"{came[what] / came['decisions']:.1%}" if "decisions" in came else ""
-
-
-def _number(what: str) -> Callable[[Mapping[str, Any]], str]:
-    """How many; empty where they were not counted."""
-    return lambda came: "" if math.isnan(came[what]) else f"{came[what]:,}"
-
-
-# What is told of a simulation, by what it is called.
-_TOLD: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
-    "cars chosen": lambda came: f"{came['cars']:,}",
-    "collisions": _number("collisions"),
-    "  by chosen cars": _number("of_guarded"),
-    "  into chosen cars": _number("into_guarded"),
-    "hard brakes": lambda came: f"{came['hard_brakes']:,}",
-    "mean speed [m/s]": lambda came: f"{came['speed']:.2f}",
-    "time lost [s]": lambda came: f"{came['time_lost']:,.0f}",
-    "RMS jerk [m/s³]": lambda came: f"{came['jerk']:.2f}",
-    "decisions": lambda came: f"{came['decisions']:,}" if "decisions" in came else "",
-    "  speed limited": _share("limited"),
-    "  driving changed": _share("revised"),
-    "  µs each": lambda came: f"{came['microseconds']:.0f}" if "decisions" in came else "",
+# What is told of a simulation, by what it is called, and how; a share is one of the decisions.
+_TOLD = {
+    "cars chosen": ("cars", ","),
+    "collisions": ("collisions", ","),
+    "  by chosen cars": ("of_guarded", ","),
+    "  into chosen cars": ("into_guarded", ","),
+    "hard brakes": ("hard_brakes", ","),
+    "mean speed [m/s]": ("speed", ".2f"),
+    "time lost [s]": ("time_lost", ",.0f"),
+    "RMS jerk [m/s³]": ("jerk", ".2f"),
+    "decisions": ("decisions", ","),
+    "  speed limited": ("limited", ".1%"),
+    "  driving changed": ("revised", ".1%"),
+    "  µs each": ("microseconds", ".0f"),
 }
+
+
+def _told(came: Mapping[str, Any], name: str, form: str) -> str:
+    """A number as it is told; empty where it was not counted, or nobody decided."""
+    number = came.get(name, math.nan)
+    number = number / came.get("decisions", math.nan) if "%" in form else number
+    return "" if math.isnan(number) else f"{number:{form}}"
 
 
 def trace_configuration(

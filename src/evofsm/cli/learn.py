@@ -57,7 +57,7 @@ def learn(
     Of a log whose columns nobody named, evofsm learn LOG prints what is in it, and what to ask.
     """
     from evofsm.cli import foreseen, learning
-    from evofsm.cli.models import tables_of
+    from evofsm.cli.models import model_document, tables_of
     from evofsm.cli.show import facts, print_json, progress, say, show, warn
     from evofsm.guard import Foresight, Guard
     from evofsm.io import Chunk, episodes_of, read_traces
@@ -123,9 +123,10 @@ def learn(
             )
         new_guard.save(guard, provenance)
     if as_json:
-        document = {"files": files, "saved": out, "guard": guard}
-        document |= learning.document_of(lesson, provenance)
-        print_json({**document, "noted": notes, "warnings": warnings})
+        document: dict[str, Any] = {"files": files, "saved": out, "guard": guard, **counts}
+        document |= {"seconds": lesson.seconds, "noted": notes, "warnings": warnings}
+        document |= {} if model.failures_told else {"failures": None}
+        print_json({**document, "model": {**model_document(model), "provenance": provenance}})
         return
     pairs = [*learning.read_of(lesson, columns.action * columns.acts)]
     pairs += learning.read_otherwise(notes, columns, counts)

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evofsm import store
-from evofsm.cli.models import model_document
 from evofsm.cli.options import Judge, imported
 from evofsm.cli.show import warn
 from evofsm.driving import SAFETY_RULE
@@ -422,13 +421,6 @@ def told_of_guard(
             yield f"It knows no action beyond --action-range, where {beyond:.1%} of the log's are."
     else:
         yield f"It reckons with brakes of {brakes:g} m/s² of the own car (--brakes)."
-
-
-def document_of(learning: Learning, provenance: Mapping[str, Any]) -> dict[str, Any]:
-    """All that is printed, for JSON; states and actions from 0."""
-    model, totals = learning.model, {**learning.counts, "seconds": learning.seconds}
-    untold = {} if model.failures_told else {"failures": None}
-    return {**totals, **untold, "model": {**model_document(model), "provenance": provenance}}
 
 
 def read_of(learning: Learning, action: str) -> Iterator[tuple[str, str]]:

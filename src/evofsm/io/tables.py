@@ -40,39 +40,39 @@ _PLAIN: Mapping[str, Any] = {"has_header": False, "ignore_errors": True, "raise_
 
 _BYTE_ORDER_MARK, _GZIP, _PARQUET = b"\xef\xbb\xbf", b"\x1f\x8b", b"PAR1"
 _SQLITE, _MCAP = b"SQLite format 3\0", b"\x89MCAP0\r\n"
-# How files begin that others hand around and we do not read: what they are, and the way out.
+# How files begin that others hand around and we do not read: what they are, and the way out. A
+# column may be called as a mark of letters alone; binary data goes on behind that.
+_BINARY = rb"(?s:.*[\0-\x08\x0e-\x1f])"
 _FOREIGN = {
-    b"\xfd7zXZ\0": "is compressed by xz; unpack it: xz --decompress --keep FILE",
-    b"\x5d\0\0": "is compressed by lzma; unpack it: xz --format=lzma --decompress --keep FILE",
-    b"BZh": "is compressed by bzip2; unpack it: bzip2 --decompress --keep FILE",
-    b"\x28\xb5\x2f\xfd": "is compressed by zstd; unpack it: zstd --decompress FILE",
-    b"PK\3\4": "is a zip archive, or an Excel workbook (.xlsx); unpack it, or save it as CSV",
-    b"\xd0\xcf\x11\xe0": "is an Excel workbook of the old kind (.xls); save it as CSV",
-    b"MATLAB ": "is a MAT-file of MATLAB; write it as CSV there: writetable",
-    b"\x89HDF": "is HDF5 (or a MAT-file of MATLAB 7.3); write its table as CSV or Parquet: pandas",
-    b"#ROSBAG ": "is a bag of ROS 1; convert it: rosbags-convert --src FILE --dst FOLDER",
-    b"LOGG": "is a CAN log of Vector (BLF); decode it to CSV: python-can, cantools",
-    b"TDSm": "is TDMS of LabVIEW; write its channels as CSV: npTDMS",
-    b"ULog\x01": "is a log of PX4 (ULog); write it as CSV: ulog2csv of pyulog",
-    b"\xa3\x95": "is a log of ArduPilot; write it as CSV: mavlogdump.py of pymavlink",
-    b"ORC": "is Apache ORC; write it as Parquet: pyarrow",
-    b"Obj\1": "is Avro; write it as CSV or Parquet: polars.read_avro",
-    b"\x80\4\x95": "is a pickle of Python, which may run anything; write its table as Parquet",
-    b"\x80\5\x95": "is a pickle of Python, which may run anything; write its table as Parquet",
-    b"MDF ": "is a measurement in ASAM MDF (MF4); write it as Parquet or CSV: asammdf",
-    b"ARROW1": "is an Arrow (Feather) file; write it as Parquet: "
+    rb"\xfd7zXZ\0": "is compressed by xz; unpack it: xz --decompress --keep FILE",
+    rb"\x5d\0\0": "is compressed by lzma; unpack it: xz --format=lzma --decompress --keep FILE",
+    rb"BZh" + _BINARY: "is compressed by bzip2; unpack it: bzip2 --decompress --keep FILE",
+    rb"\x28\xb5\x2f\xfd": "is compressed by zstd; unpack it: zstd --decompress FILE",
+    rb"PK\x03\x04": "is a zip archive, or an Excel workbook (.xlsx); unpack it, or save it as CSV",
+    rb"\xd0\xcf\x11\xe0": "is an Excel workbook of the old kind (.xls); save it as CSV",
+    rb"MATLAB " + _BINARY: "is a MAT-file of MATLAB; write it as CSV there: writetable",
+    rb"\x89HDF": "is HDF5 (or a MAT-file of MATLAB 7.3); write its table as CSV or Parquet: pandas",
+    rb"#ROSBAG ": "is a bag of ROS 1; convert it: rosbags-convert --src FILE --dst FOLDER",
+    rb"LOGG" + _BINARY: "is a CAN log of Vector (BLF); decode it to CSV: python-can, cantools",
+    rb"TDSm" + _BINARY: "is TDMS of LabVIEW; write its channels as CSV: npTDMS",
+    rb"ULog\x01": "is a log of PX4 (ULog); write it as CSV: ulog2csv of pyulog",
+    rb"\xa3\x95": "is a log of ArduPilot; write it as CSV: mavlogdump.py of pymavlink",
+    rb"ORC" + _BINARY: "is Apache ORC; write it as Parquet: pyarrow",
+    rb"Obj\x01": "is Avro; write it as CSV or Parquet: polars.read_avro",
+    rb"\x80[\x04\x05]\x95": "is a pickle of Python, which may run anything; write its table as "
+    "Parquet",
+    rb"MDF " + _BINARY: "is a measurement in ASAM MDF (MF4); write it as Parquet or CSV: asammdf",
+    rb"ARROW1" + _BINARY: "is an Arrow (Feather) file; write it as Parquet: "
     "polars.read_ipc('FILE').write_parquet('drive.parquet')",
-    b"\xff\xfe": "is text in UTF-16; write it in UTF-8: iconv -f UTF-16 -t UTF-8 FILE > drive.csv",
-    b"\xfe\xff": "is text in UTF-16; write it in UTF-8: iconv -f UTF-16 -t UTF-8 FILE > drive.csv",
-    b"\x93NUMPY": "is an array of NumPy; write it as CSV with the names of its columns: "
+    rb"\xff\xfe|\xfe\xff": "is text in UTF-16; write it in UTF-8: "
+    "iconv -f UTF-16 -t UTF-8 FILE > drive.csv",
+    rb"\x93NUMPY": "is an array of NumPy; write it as CSV with the names of its columns: "
     "numpy.savetxt('drive.csv', numpy.load('FILE'), delimiter=',', header='time,gap,...')",
-    b"version https://git-lfs": "is a pointer of Git LFS; fetch the file itself: git lfs pull",
-    b"UnFinMF ": "is a measurement in ASAM MDF that was not finalized; write it as CSV: asammdf",
-    b"[{": "is JSON; write its rows as CSV: polars.read_json('FILE').write_csv('drive.csv')",
-    b"{": "is JSON; write its rows as CSV: polars.read_ndjson('FILE').write_csv('drive.csv')",
-}
-# And texts that are no tables.
-_NO_TABLE = {
+    rb"version https://git-lfs": "is a pointer of Git LFS; fetch the file itself: git lfs pull",
+    rb"UnFinMF " + _BINARY: "is a measurement in ASAM MDF that was not finalized; write it as CSV: "
+    "asammdf",
+    rb"\[\s*{": "is JSON; write its rows as CSV: polars.read_json('FILE').write_csv('drive.csv')",
+    rb"{": "is JSON; write its rows as CSV: polars.read_ndjson('FILE').write_csv('drive.csv')",
     rb"\(\d+\.\d+\) \w+ [0-9A-F]+#": "is a CAN log (candump); decode it to CSV: cantools",
     rb"date .*\n\s*base (hex|dec)": "is a CAN log of Vector (ASC); decode it to CSV: "
     "python-can, cantools",
@@ -147,16 +147,12 @@ def file_kind(path: str) -> Kind:
         return "osi"
     with Source(path) as source:
         head = source.read(4096).removeprefix(_BYTE_ORDER_MARK).lstrip()
-        head, is_packed = re.sub(rb"\A\[\s+", b"[", head), source.is_packed
+        is_packed = source.is_packed
     if not head:
         raise ValueError(f"{path} is empty")
     if b'{"__metadata__"' in head:
         raise ValueError(f"{path} holds what was learnt, and is no log: evofsm inspect prints it")
-    marks = [mark for mark in _FOREIGN if head.startswith(mark)]
-    # A column may be called as a mark of letters alone; binary data goes on behind that.
-    marks = [mark for mark in marks if not mark.strip().isalnum() or _CONTROL.search(head)]
-    foreign = [_FOREIGN[mark] for mark in marks]
-    if foreign := foreign or [says for text, says in _NO_TABLE.items() if re.match(text, head)]:
+    if foreign := [says for text, says in _FOREIGN.items() if re.match(text, head)]:
         raise ValueError(f"{path} {foreign[0].replace('FILE', path)}")
     tables = {*re.findall(rb"CREATE TABLE \W?(\w+)", head)}
     if head.startswith(_SQLITE) and tables and b"topics" not in tables:
@@ -167,13 +163,11 @@ def file_kind(path: str) -> Kind:
     if head.startswith(_MCAP):
         return "bag" if head[_PROFILE:].startswith(b"ros2") else "mcap"
     kinds: dict[bytes, Kind] = {_PARQUET: "parquet", _SQLITE: "bag", b"<": "xml"}
-    for mark, kind in kinds.items():
-        if head.startswith(mark):
-            return kind
-    if b"\0" in head[:64]:  # further down it is a bad row
+    kind: Kind = next((kind for mark, kind in kinds.items() if head.startswith(mark)), "csv")
+    if kind == "csv" and b"\0" in head[:64]:  # further down it is a bad row
         cause = "an archive, binary data, or text in UTF-16?"
         raise ValueError(f"{path} is not text in UTF-8 ({cause})")
-    return "csv"
+    return kind
 
 
 @dataclass

@@ -121,7 +121,7 @@ def monitor(
     from evofsm.cli.monitor.decider import EPISODE, Decider, begun, prepare
     from evofsm.cli.monitor.slots import Slots
     from evofsm.cli.monitor.state import State
-    from evofsm.cli.monitor.summary import Text
+    from evofsm.cli.monitor.summary import Text, decided_on_lines, decided_on_log, summary_of
     from evofsm.cli.monitor.transports import Server, Stream, json_line, transport_of
     from evofsm.cli.show import show, warn
     from evofsm.driving.cars import assumptions, guard_of_monitor
@@ -228,8 +228,6 @@ def monitor(
             texts = ", ".join(f"{name} in {unit}" for name, unit in units.items())
             notice += f"; CSV has {texts} as in the guard's log, unless a row of units says others"
         if summary and file is not None:
-            from evofsm.cli.monitor.summary import decided_on_lines, decided_on_log, summary_of
-
             warn(notice)
             answers = decided_on_log(decider, chunks) if chunks else decided_on_lines(decider, file)
             show(*summary_of(decider, answers, str(file)))

@@ -25,7 +25,6 @@ from evofsm.driving.family import definitions_of
 from evofsm.driving.naming import UNITS, VARIABLES
 from evofsm.driving.sumo import open_world
 from evofsm.driving.world import GAP_BEHIND, LEADER_ACCELERATION, LEADER_SPEED, SPEED, World
-from evofsm.extras import needs
 from evofsm.fsm import EvolvingFSM, Labels, Novelty
 from evofsm.fsm.proportions import usual_range
 from evofsm.guard import Foresight, Guard, LearntRisk, Mode
@@ -175,8 +174,8 @@ class Simulated:
         seed: int = 0,
         tolerance: float = TOLERANCE,
     ) -> None:
-        with needs("gymnasium", "gym", "an environment of Gymnasium"):
-            from evofsm.guard import gym
+        from evofsm.guard import gym
+
         if not isinstance(env, gym.gymnasium.Env):  # type: ignore[attr-defined]
             raise TypeError(f"environment() returns {type(env).__name__}, not one gymnasium.Env")
         self.name, self.seed, self.cases = name, seed, _DRAWS
@@ -293,8 +292,8 @@ def read_simulated(what: str, **settings: Any) -> Simulated | None:
             return Simulated(Path(what).stem, definitions["environment"](), **parts, **settings)
     if not re.search(r"-v\d+$", what):
         return None
-    with needs("gymnasium", "gym", "an environment of Gymnasium"):
-        import gymnasium
+    from evofsm.guard.gym import gymnasium  # type: ignore[attr-defined]
+
     try:
         return Simulated(what, gymnasium.make(what), **settings)
     except gymnasium.error.Error as error:
