@@ -266,7 +266,7 @@ def test_a_summary_says_how_often_it_alarms_and_is_risky_and_where_it_is_worst(t
         (("--interval", -1), "interval"),
         (("--tolerance", 2), "tolerance is 2"),
         (("--guard", "nowhere", "--brakes", 5), "nowhere has learnt its own"),
-        (("--guard", "nowhere", "--n-actions", 3), "--n-actions is for a guard that is made here"),
+        (("--guard", "nowhere", "--n-actions", 3), "--n-actions: only for a guard that is made"),
         (("--observe", "heat", "--interval", 1), "say who acts: --low and --high, --n-actions"),
         (("--observe", "heat", "--low", 0, "--high", 1), "say how often rows come [s]"),
         (("--action", "", "--interval", 1), "say what is observed, the keys of rows: --observe"),
@@ -275,8 +275,8 @@ def test_a_summary_says_how_often_it_alarms_and_is_risky_and_where_it_is_worst(t
         (("a.csv", "--plot", "x.png"), "--plot draws what --summary says"),
         (("a.parquet", "--text"), "a.parquet is read with --summary; live rows are JSON or CSV"),
         (("a.csv", "b.csv", "--summary"), "one FILE is read; cat joins several"),
-        (("--hold", 0.5), "--hold is for logs (.csv, .parquet, "),
-        (("--skip-bad", 0), "--skip-bad is for logs"),
+        (("--hold", 0.5), "--hold: only for logs (.csv, .parquet, "),
+        (("--skip-bad", 0), "--skip-bad: only for logs"),
     ],
 )
 def test_what_cannot_be_is_said_in_a_line(refused, arguments, said):

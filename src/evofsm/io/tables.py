@@ -40,9 +40,10 @@ _PLAIN: Mapping[str, Any] = {"has_header": False, "ignore_errors": True, "raise_
 
 _BYTE_ORDER_MARK, _GZIP, _PARQUET = b"\xef\xbb\xbf", b"\x1f\x8b", b"PAR1"
 _SQLITE, _MCAP = b"SQLite format 3\0", b"\x89MCAP0\r\n"
+_CONTROL = re.compile(rb"[\0-\x08\x0e-\x1f]")  # what no text holds
 # How files begin that others hand around and we do not read: what they are, and the way out. A
 # column may be called as a mark of letters alone; binary data goes on behind that.
-_BINARY = rb"(?s:.*[\0-\x08\x0e-\x1f])"
+_BINARY = rb"(?s:.*" + _CONTROL.pattern + rb")"
 _FOREIGN = {
     rb"\xfd7zXZ\0": "is compressed by xz; unpack it: xz --decompress --keep FILE",
     rb"\x5d\0\0": "is compressed by lzma; unpack it: xz --format=lzma --decompress --keep FILE",
@@ -105,7 +106,6 @@ _COMMENT = re.compile(r"\A\s*(#|%|//)+\s*")  # what stands before the last line 
 MISSING = ("", "na", "n/a", "nan", "null", "none")  #: what stands in a field where nothing does
 # By which a comma is known to be a decimal one; thousands it may separate as well, but of no zero.
 _DECIMAL_COMMA = re.compile(r"\s*-?(0,\d+|\d+,(\d\d?|\d{4,}))\s*")
-_CONTROL = re.compile(rb"[\0-\x08\x0e-\x1f]")  # what no text holds
 _DATE = re.compile(r"\s*\d{4}-?\d\d-?\d\d[Tt ]")
 # The day first, as only dots tell; whether its year has a century, and whether seconds follow.
 _DAY_FIRST = re.compile(r"\d\d?\.\d\d?\.(?:(\d{4})|\d\d),?[T ]+\d\d?:\d\d(:)?")

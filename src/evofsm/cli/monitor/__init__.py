@@ -10,6 +10,8 @@ from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 
+from typer import Context
+
 from evofsm.cli import options
 from evofsm.cli.options import argument, option
 
@@ -18,11 +20,14 @@ _INTERVAL = 0.1  # of rows of cars, where nobody said another one [s]
 # What other files end with holds live rows; so does CSV without --summary.
 _LOGS = (".csv", ".parquet", ".xml", ".gz", ".mcap", ".db3", ".osi")
 _OF_LOGS = ("hold", "dt", "skip_bad", "vehicle_length", "topics")  # as live rows are not read
+# And how a guard is made, which a saved one says itself.
+_OF_GUARDS = ("low", "high", "n_actions", "interval", "horizon", "persist", "brakes")
 _SAVED = b'{"__metadata__"'  # in the beginning of what was saved
 
 
 @options.reads_logs
 def monitor(
+    ctx: Context,
     files: Annotated[
         list[Path] | None,
         argument(
@@ -110,9 +115,10 @@ def monitor(
     is_log = file is not None and (file.suffix in _LOGS[not summary :] or file.is_dir())
     if is_log and not summary:
         raise ValueError(f"{file} is read with --summary; live rows are JSON or CSV, a line each")
-    if not is_log and (idle := [name for name in _OF_LOGS if name in reading]):
-        name = idle[0].replace("_", "-")
-        raise ValueError(f"--{name} is for logs ({', '.join(_LOGS)}), read with --summary")
+    logs = f"logs ({', '.join(_LOGS)}), read with --summary"
+    options.refuse_typed(ctx, () if is_log else _OF_LOGS, logs)
+    own = f"a guard that is made here; {guard} has learnt its own"
+    options.refuse_typed(ctx, () if guard is None else _OF_GUARDS, own)
     if traffic and (guard or state or learn or is_log):
         raise ValueError("--traffic judges scenes alone: no log, --guard, --state or --learn")
     if summary and (file is None or state or audit):
@@ -131,14 +137,9 @@ def monitor(
     from evofsm.guard.foresight import span
     from evofsm.io.tables import is_number
 
-    acts = {"low": low, "high": high, "n_actions": n_actions}
-    choices: dict[str, Any] = {**acts, "interval": interval, "horizon": horizon}
-    choices |= {"persist": persist or None, "brakes": brakes if brakes != options.BRAKES else None}
-    if guard is not None and (idle := [name for name, part in choices.items() if part is not None]):
-        name = idle[0].replace("_", "-")
-        raise ValueError(f"--{name} is for a guard that is made here; {guard} has learnt its own")
-    parts, alarms = {**acts, "observe": observe}, (horizon, persist, false_a_day)
+    parts = {"low": low, "high": high, "n_actions": n_actions, "observe": observe}
     system = {name: part for name, part in parts.items() if part is not None}
+    alarms = horizon, persist, false_a_day
     how: Any = brakes, options.TOLERANCE if tolerance is None else tolerance
     make: Any = partial(guard_of_monitor, interval or _INTERVAL, *how, traffic=traffic)
     log_options, units = options.read_with(guard or state)
