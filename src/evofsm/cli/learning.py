@@ -27,7 +27,7 @@ from evofsm.guard import ActionReviser, Foresight, Guard, LearntRisk, Mode
 from evofsm.guard.actions import limits
 from evofsm.guard.foresight import span
 from evofsm.io import Chunk, LogColumns, episodes_of, read_traces
-from evofsm.io.logs import Noted
+from evofsm.io.logs import STAND_INS, Noted
 from evofsm.io.tables import IN_UTC, SI, TIMES, UNITS, quoted_name, unit_of
 
 # A unit at the end of a column's name, behind another letter or as a word of its own.
@@ -54,7 +54,7 @@ _NO_SPEED = 500.0  # no car's speed in any unit [m/s]: revolutions, perhaps
 #: Columns of more different numbers are no choice among some; and the most intervals for those.
 MOST_LEVELS, _MOST_INTERVALS = 12, 50
 _MOST_ACTIONS = 1000
-_NOBODY = (0.0, -1.0, 255.0, 999.0, 9999.0, 65535.0)  # stand for that in many recordings
+_NOBODY = (0.0, -1.0, 255.0, *STAND_INS)  # stand for that in many recordings
 
 
 class Learning(NamedTuple):

@@ -159,10 +159,8 @@ class Decider:
         next_place = len(recent) if self._next is None else self._next + 1
         if next_place < len(recent) and recent[next_place][0] == told:
             return next_place
-        if told == self.latest:
-            return len(recent) - 1
-        if when is None:
-            return None  # it says of no episode in particular that it ended
+        if when is None:  # it says of no episode in particular that it ended
+            return len(recent) - 1 if told == self.latest else None
         for place, (message, _) in reversed([*enumerate(recent)]):
             if message == told:
                 return None if isinstance(told, Row) and self._begins_anew(told, place) else place
