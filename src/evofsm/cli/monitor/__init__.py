@@ -117,8 +117,8 @@ def monitor(
         raise ValueError(f"{file} is read with --summary; live rows are JSON or CSV, a line each")
     logs = f"logs ({', '.join(_LOGS)}), read with --summary"
     options.refuse_typed(ctx, () if is_log else _OF_LOGS, logs)
-    own = f"a guard that is made here; {guard} has learnt its own"
-    options.refuse_typed(ctx, () if guard is None else _OF_GUARDS, own)
+    guards = f"a guard that is made here; {guard} has learnt its own"
+    options.refuse_typed(ctx, () if guard is None else _OF_GUARDS, guards)
     if traffic and (guard or state or learn or is_log):
         raise ValueError("--traffic judges scenes alone: no log, --guard, --state or --learn")
     if summary and (file is None or state or audit):
