@@ -2,7 +2,6 @@
 
 import os
 import re
-import shutil
 import subprocess
 import sys
 import textwrap
@@ -68,35 +67,3 @@ def test_a_family(tmp_path):
     write("Add a family, or a world", tmp_path)
     said = python(tmp_path, "-m", "evofsm", "drive", "mine.py", "--episodes", 3)
     assert "mine, 3 training episodes" in said
-
-
-# Run where the counter was added; prints nothing where all is well.
-COUNTED = """
-import sys
-import numpy as np
-from pathlib import Path
-from evofsm import EvolvingFSM, FSMModel, Novelty
-
-folder, rule = Path(sys.argv[1]), Novelty(radius=1.0)
-one = EvolvingFSM(1, rule=rule)
-one.learn_many([[0.0], [3.0], [3.1], [3.0], [0.0], [0.1]], [0] * 6, episode_starts=[0, 3])
-assert one.begun.tolist() == [1.0, 1.0], one.begun  # it counts
-assert one.model().begun.tolist() == [1.0, 1.0]
-one.save(folder / "machine")
-one.model().save(folder / "model")
-assert EvolvingFSM.load(folder / "machine").begun.tolist() == [1.0, 1.0]
-assert FSMModel.load(folder / "model").begun.tolist() == [1.0, 1.0]
-
-full = EvolvingFSM(1, rule=rule, max_states=2)
-full.learn_many([[0.0], [1.5], [9.0]], [0] * 3, episode_starts=[0, 1])
-assert full.begun.tolist() == [2.0, 0.0], full.begun  # two were joined, and an index is free
-"""
-
-
-def test_a_counter_counts_and_is_kept_joined_and_cleared(tmp_path):
-    recipe = re.search(r"```diff\n(.*?)```", chapter("Add a counter"), re.DOTALL)[1]
-    shutil.copytree(ROOT / "src", tmp_path / "src", ignore=shutil.ignore_patterns("__pycache__"))
-    subprocess.run(["git", "apply"], input=recipe, text=True, cwd=tmp_path, check=True)
-    # Without a compiler, which would compile all kernels anew.
-    there = {"PYTHONPATH": str(tmp_path / "src"), "NUMBA_DISABLE_JIT": "1"}
-    python(tmp_path, "-Wignore", "-c", COUNTED, tmp_path, **there)
