@@ -268,11 +268,11 @@ class Traffic(Study):
         """Networks that were asked for; a ValueError names one that is not there."""
         asked, game = lib.names_in(self.worlds), demos()
         for each in asked:
-            if each in DEMOS and not game:
-                fault = f"{each} is a demo of SUMO, and there are none here"
-                raise ValueError(f"{fault}: pip install eclipse-sumo, or --worlds {','.join(OWN)}")
             if each not in OWN and not (game and (game / f"{each}.sumocfg").exists()):
-                raise ValueError(f"there is no network {each}; there are {', '.join(OWN)}")
+                demo = "demos of SUMO, where they are: pip install eclipse-sumo"
+                raise ValueError(
+                    f"there is no network {each}; there are {', '.join(OWN)}, and {demo}"
+                )
         return asked
 
     def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:

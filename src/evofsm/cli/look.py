@@ -64,6 +64,7 @@ _WHO = re.compile("ma(sch|ch)ine|device|ger(ä|ae)t|asset|unit|anlage|pump|motor
 _CODE = re.compile(f"{_FAILURE.pattern}|stat|zustand|code", re.IGNORECASE)
 _LONG = "20ms 50ms 100ms 200ms 500ms 1s 2s 5s 10s 20s 30s 1min 2min 5min 10min 30min 1h 5h 10h 1d"
 _NICE = [(seconds("", text), text) for text in _LONG.split()]
+_RUNS = "--episode", "run"  # where runs are numbered first
 
 
 def show_look(files: Sequence[str], table: CsvTable | ParquetTable) -> None:
@@ -72,6 +73,7 @@ def show_look(files: Sequence[str], table: CsvTable | ParquetTable) -> None:
     contents, options, before = look_at(table)
     if len(files) > 1:
         title += f", the first of {len(files):,} files; the others were not looked at"
+        options = [option for option in options if option != _RUNS]
     show(facts(title, contents))
     if not (options or before):
         texts = (explained(table.first(n)) for n in table.columns if table.holds(n) == "text")
@@ -84,7 +86,7 @@ def show_look(files: Sequence[str], table: CsvTable | ParquetTable) -> None:
     if before and len(files) == 1:
         kind = "csv" if isinstance(table, CsvTable) else "parquet"
         mark, how = f", separator={table.separator!r}" * (kind == "csv"), ", infer_schema=False"
-        suffix = "sorted" if "run=" not in before else "runs"
+        suffix = "runs" if _RUNS in options else "sorted"
         files = [f"{Path(file).name.partition('.')[0]}-{suffix}.{kind}"]
         read = f"p.read_{kind}({file!r}{mark}{how * bool(mark)})"
         code = f"{read}{before}.write_{kind}({files[0]!r}{mark})"
@@ -193,8 +195,8 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     options += [("--failed", text) for _, text, *_ in rare[:1]]
     before = f".sort({group!r}, maintain_order=True)" if group else ".reverse()"
     if begins is not None:
-        facts.append(("an episode?", f"where {clock} begins anew: number these runs, as below"))
-        options.append(("--episode", "run"))
+        facts.append(("an episode?", f"where {clock} begins anew: number these runs"))
+        options.append(_RUNS)
         falls = f"(p.col({clock!r}).cast(float).diff() < 0).fill_null(False)"
         before = f".with_columns(run={falls}.cum_sum())"
     if group:
@@ -207,13 +209,11 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     spans = {n: np.nanquantile(z, (0.02, 0.98)) for n, z in spans.items()}
     if still in spans and spans[still][1] < 1.05 * spans[still][0]:  # it is always the same
         del spans[still]
-    series = {n: values[n][order] for n in spans}
-    there = {n: np.isfinite(z) for n, z in series.items()}
-    moves = {n: np.diff(z[there[n]]) for n, z in series.items()}
+    there = {n: np.isfinite(values[n][order]) for n in spans}
+    moves = {n: np.diff(values[n][order][rows]) for n, rows in there.items()}
+    steps = {n: moves[n][np.diff(segments[rows]) == 0.0].tolist() for n, rows in there.items()}
     # What goes on by the same from row to row of an episode is a count of them.
-    goes_on = {n: np.diff(segments[there[n]]) == 0.0 for n in spans}
-    tallies = {n for n, steps in moves.items() if len({*steps[goes_on[n]].tolist()}) < 2}
-    steady = {n: e.tolist() for n, e in spans.items() if e[1] > e[0] and n not in tallies}
+    steady = {n: e.tolist() for n, e in spans.items() if e[1] > e[0] and len({*steps[n]}) > 1}
     one_way = [n for n in steady if len(last) > 2 and len(set(np.sign(moves[n])) - {0.0}) == 1]
     if one_way and len(one_way) < len(steady):
         facts.append(("left out", f"{', '.join(one_way)}: never comes back, as an odometer"))
