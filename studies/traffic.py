@@ -263,21 +263,13 @@ class Traffic(Study):
         few: dict[str, Any] = {"regains": (2.0,), "seconds": (30.0, 70.0), "episodes": (10, 20)}
         return replace(self, seeds=1, worlds="drop,road", **few)
 
-    @property
-    def there(self) -> list[str]:
-        """Networks that were asked for; a ValueError names one that is not there."""
-        asked, game = lib.names_in(self.worlds), demos()
-        for each in asked:
-            if each not in OWN and not (game and (game / f"{each}.sumocfg").exists()):
-                demo = "demos of SUMO, where they are: pip install eclipse-sumo"
-                raise ValueError(
-                    f"there is no network {each}; there are {', '.join(OWN)}, and {demo}"
-                )
-        return asked
-
     def run(self, workers: int | None = None) -> dict[str, pl.DataFrame]:
         """Simulate all, then learn and drive the family."""
-        there, (calm, risky) = self.there, self.seconds
+        there, game, (calm, risky) = lib.names_in(self.worlds), demos(), self.seconds
+        for each in there:
+            if each not in OWN and not (game and (game / f"{each}.sumocfg").exists()):
+                fault = f"there is no network {each}; there are {', '.join(OWN)}"
+                raise ValueError(f"{fault}, and demos, where SUMO is: pip install eclipse-sumo")
         kinds = [(world, DRIVERS[0], calm) for world in there]
         kinds += [(world, each, risky) for world in there if world in OWN for each in DRIVERS[1:]]
         tasks, curve = [], []

@@ -188,15 +188,14 @@ def test_a_first_look_takes_no_good_ending_for_a_failure_and_observes_no_outcome
     assert "--observe level " in found  # nor the label of whole runs, nor a count of rows
     assert "--failed terminated==1 " in found
     asked = "learn", "gym.csv", "--observe", "level", "--action", "", "--dt", 1, "--episode", "run"
-    assert "does --failed mark all rows of an" in evofsm(*asked, "--failed", "failed").stderr
+    assert "does --failed mark all its rows?" in evofsm(*asked, "--failed", "failed").stderr
     assert "does --failed say the reverse?" in refused(*asked, "--failed", "level>-1")
-    text = "\n".join(row.partition(",")[2] for row in rows)  # which tells no runs
-    Path("bare.csv").write_text(text.replace("step", "time", 1))
-    looked = evofsm("learn", "bare.csv").stdout
-    before, _, command = looked.partition("to learn from it:\n")[2].rpartition("  evofsm ")
+    bare = "\n".join(row.partition(",")[2] for row in rows)  # which tells no runs
+    Path("bare.csv").write_text(bare.replace("step", "time", 1))
+    _, _, proposal = evofsm("learn", "bare.csv").stdout.partition("to learn from it:\n")
+    before, _, command = proposal.replace("\\\n", "").rpartition("  evofsm ")
     shell(before.strip())
-    learnt = evofsm(*shlex.split(command.replace("\\\n", "")))
-    assert "12 episodes ended with terminated==1" in learnt.stdout
+    assert "12 episodes ended with terminated==1" in evofsm(*shlex.split(command)).stdout
 
 
 @pytest.mark.parametrize(

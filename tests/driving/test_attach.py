@@ -130,8 +130,8 @@ def test_where_drivers_keep_their_distance_guards_do_no_harm(road, step, options
         assert cars.summary().get("limited", 0) == 0  # nobody had to brake hard until now
         sumo.vehicle.setMaxSpeed("lead", 3.0)
         drive(sumo, 40.0, brakes_at=np.inf)
-        sumo.vehicle.setSpeed("lead", 0.0)
-        drive(sumo, 40.0, brakes_at=np.inf)  # they come up to it, and creep on to `minGap`
+        sumo.vehicle.setSpeed("lead", 0.0)  # they come up to it, and creep on to `minGap`
+        drive(sumo, 40.0, brakes_at=np.inf)
         found.append(cars.summary())
         cars.detach()
     alone, guarded = found

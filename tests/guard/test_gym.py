@@ -428,18 +428,13 @@ def test_a_list_of_infos_is_made_above_the_guard_and_statistics_that_change_no_m
 
 
 def test_an_environment_is_not_put_under_one_guard_twice():
-    guard, said = guard_for(Discrete(2)), "under this guard already.*make it anew"
+    guard, other = guard_for(Discrete(2)), guard_for(ONE)
     one = wrappers.TimeLimit(RevisedActions(cart(), guard), 9)
-    many = RevisedVectorActions(SyncVectorEnv([cart]), guard)
-    agents = RevisedAgents(Crowd(2), runners := guard_for(ONE))
-    with pytest.raises(ValueError, match=said):
-        RevisedActions(one, guard)
-    for envs in (many, SyncVectorEnv([lambda: one])):
-        with pytest.raises(ValueError, match=said):
-            RevisedVectorActions(envs, guard)
-    with pytest.raises(ValueError, match=said):
-        RevisedAgents(agents, runners)
-    RevisedActions(one, guard_for(Discrete(2)))  # another one may look at what is left
+    agents, many = RevisedAgents(Crowd(2), other), SyncVectorEnv([lambda: one])
+    wraps = (RevisedActions, one, guard), (RevisedVectorActions, many, guard)
+    for wrap, env, same in (*wraps, (RevisedAgents, agents, other)):
+        with pytest.raises(ValueError, match=r"under this guard already.*make it anew"):
+            wrap(env, same)
 
 
 def test_a_guard_that_is_narrower_than_the_environment_is_told_of_and_in_shadow_changes_nothing():

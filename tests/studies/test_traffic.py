@@ -24,8 +24,5 @@ def test_late_drivers_are_simulated_beside_themselves_without_guards():
 
 def test_networks_that_are_not_there_are_refused(monkeypatch):
     monkeypatch.setattr(traffic, "demos", lambda: None)
-    for world in ("A10KW", "nowhere"):
-        with pytest.raises(
-            ValueError, match=rf"no network {world}; there are drop, road, grid, and"
-        ):
-            Traffic(worlds=f"drop,{world}").run()
+    with pytest.raises(ValueError, match="no network A10KW; there are drop, road, grid, and demos"):
+        Traffic(worlds="drop,A10KW").run()

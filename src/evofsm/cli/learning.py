@@ -164,11 +164,11 @@ def warnings_of(noted: Noted, columns: LogColumns | None = None) -> list[str]:
         hint = f"does that stand for {missing(f'{name}=={value:g}')}"
         warnings.append(f"{share} failed episodes {fault}: {hint}")
     if noted.failed_at_once:
-        why = "right after a hole or standstill: what led there was not recorded, so no alarm "
-        why += "could foresee them"
+        why = "right after a hole or standstill: what led there was not recorded"
         if 2 * noted.failed_at_once > noted.failed:
-            why = "with an episode's first row: does --failed mark all rows of an episode that "
-            why += "failed? Mark its last one alone. Or do holes or standstills end them?"
+            why = (
+                "with an episode's first row: does --failed mark all its rows? Mark the last alone"
+            )
         warnings.append(f"{share} failures came {why}")
     if alone := [(name, *pair) for name, pair in noted.below.items() if pair[0] and pair[1] > 2]:
         name, value, rows = min(alone, key=lambda entry: entry[1] not in _NOBODY)

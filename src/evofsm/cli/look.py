@@ -196,7 +196,7 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     before = f".sort({group!r}, maintain_order=True)" if group else ".reverse()"
     if begins is not None:
         facts.append(("an episode?", f"where {clock} begins anew: number these runs"))
-        options.append(_RUNS)
+        options, is_mixed = [*options, _RUNS], True
         falls = f"(p.col({clock!r}).cast(float).diff() < 0).fill_null(False)"
         before = f".with_columns(run={falls}.cum_sum())"
     if group:
@@ -226,8 +226,7 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
         if units[n] and not table.units.get(n):
             options.append(("--unit", f"{_named(n, '=')}={units[n]}"))
     levels = np.unique(values[action][np.isfinite(values[action])]) if action else np.zeros(0)
-    is_whole = begins is None and not is_mixed
-    return facts, _of_numbers(steady, action, levels, options), "" if is_whole else before
+    return facts, _of_numbers(steady, action, levels, options), before if is_mixed else ""
 
 
 def _first_rows(

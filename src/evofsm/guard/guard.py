@@ -191,8 +191,7 @@ class Guard:
 
     Notes
     -----
-    A learnt judge needs an angle that turns round as its cosine and sine: told the angle itself,
-    it prevented hardly a failure of a robot that the two kept from most.
+    Observe an angle that turns round as its cosine and sine: else little is foreseen.
 
     Threads may share a guard: each call is done before the next begins, and what it decides on is
     one stream of observations. `machine` and `judge` themselves have to be left alone meanwhile.

@@ -103,8 +103,7 @@ class RevisedActions(_Settled, gymnasium.Wrapper[Any, Any, Any, Any], RecordCons
         such as no car ahead: then nothing is revised or learnt. NaN is what was not observed.
         Without it a box is flattened, each value of ``Discrete`` is a variable that is 1 or 0, and
         parts of ``Dict`` and ``Tuple`` follow each other, but for an ``action_mask``. Of 1 and 0 a
-        guard foresees little: give places as coordinates, ``lambda s: (s // 4, s % 4)`` on
-        FrozenLake.
+        guard foresees little: give coordinates, on FrozenLake ``lambda s: (s // 4, s % 4)``.
     failed : callable or "terminated"
         From a step (``observation``, ``reward``, ``terminated``, ``truncated``, ``info``) to
         whether it ended in failure. ``"terminated"`` says that all that are terminated failed, as

@@ -79,12 +79,9 @@ class Mode(Enum):
 
 
 def proposed(actions: ActionSet | None, reply: Proposal | ArrayLike | None) -> Proposal:
-    """What a controller wants, of the right type, whatever its values; of None no action.
-
-    Whatever was replied, if no set is known.
-    """
+    """What a controller wants, of the right type, whatever its values; of None no action."""
     action, mask = reply if isinstance(reply, Proposal) else (reply, None)
-    if actions is None:
+    if actions is None:  # of which nothing is known
         return Proposal(action)
     if action is None:
         action = no_action(actions)
