@@ -229,6 +229,7 @@ def test_between_batches_nothing_may_stand_or_what_is_left_out(tmp_path, pieces)
         (b"PK\3\4" + bytes(50), "an Excel workbook"),
         (b'[\n  {"time": 0}]', "is JSON"),
         (b"(1436509052.249713) vcan0 044#2A366C2BBA\n", "is a CAN log (candump)"),
+        (HEADER.encode() + b"\r0,1,2,3,4\r", "lines that end in CR alone"),
         (b"date Mon Nov 30 10:00:00.000 am 2026\nbase hex  timestamps absolute\n", "Vector (ASC)"),
         (b"tank,plant=a level=1.2,valve=3i 1465839830100400200\n", "line protocol of InfluxDB"),
         (b"$GPRMC,123519,A,4807.038,N,01131.000,E*6A\r\n", "holds sentences of NMEA 0183"),

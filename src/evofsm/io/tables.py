@@ -81,6 +81,8 @@ _FOREIGN = {
     rb"# (HELP|TYPE) \w+ \w": "is what Prometheus fetches; write its series as CSV, a column each",
     rb"\w[^\s,=]*(,[^\s,=]+=[^\s,]+)* [^\s,=]+=[^,\n]+(,[^\s,=]+=[^,\n]+)*( \d{10,})?\n": "is line "
     "protocol of InfluxDB; write it as CSV, with a column for each field",
+    rb"[^\0-\x08\x0e-\x1f\n<]*\r[^\0-\x08\x0e-\x1f\n<]+\Z": "has lines that end in CR alone, as of "
+    "old Macs; write them with LF: tr '\\r' '\\n' < FILE > drive.csv",
 }
 _LABVIEW = "***End_of_Header***"  # what stands above its table, twice
 _PROFILE = len(_MCAP) + 1 + 8 + 4  # of MCAP, behind the mark, an opcode and two lengths
