@@ -120,8 +120,10 @@ def test_no_text_from_a_file_tells_the_terminal_what_to_do(evofsm, tmp_path):
         ("explain", tmp_path / "model", "--state", "all"),
         ("explain", tmp_path / "model", "--state", 1, "--json"),
         *(("export", tmp_path / "model", "--to", to) for to in ("dot", "prism")),
-        ("inspect", tmp_path / evil),
+        *(("inspect", tmp_path / evil), ("learn", tmp_path / "log.csv")),
     ]
+    rows = [f"{k},{k % 7},{k % 5}" for k in range(40)]
+    (tmp_path / "log.csv").write_text("\n".join([f"t,{evil.replace(chr(13), '')},c", *rows]))
     for arguments in printed:
         result = evofsm(*arguments)
         told = result.stdout + result.stderr

@@ -350,6 +350,13 @@ def test_a_reader_that_vanishes_ends_it_in_a_line():
 
 
 @posix
+def test_where_nothing_can_be_written_on_standard_error_decisions_go_on():
+    with open("/dev/full", "w") as full, started("monitor", stderr=full) as process:
+        assert asked(process, ROWS[0].strip())["kind"] == "decision"
+        process.communicate(timeout=PATIENCE)
+
+
+@posix
 @pytest.mark.slow
 def test_a_client_in_c_gets_its_alarm_by_a_socket(tmp_path):
     compiler = shlex.split(os.environ.get("CC", "cc"))

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from evofsm.cli.learning import range_of, unit_in
 from evofsm.cli.options import in_quotes, quoted, seconds
 from evofsm.cli.show import facts, show
+from evofsm.fsm.naming import visible
 from evofsm.guard.foresight import span
 from evofsm.io import tables
 from evofsm.io.logs import SKIPPED, USUAL_EPISODE, are_stand_ins, are_unusual, hours_unsaid
@@ -90,10 +91,10 @@ def show_look(files: Sequence[str], table: CsvTable | ParquetTable) -> None:
         files = [f"{Path(file).name.partition('.')[0]}-{suffix}.{kind}"]
         read = f"p.read_{kind}({file!r}{mark}{how * bool(mark)})"
         code = f"{read}{before}.write_{kind}({files[0]!r}{mark})"
-        print(f"  python -c {in_quotes(f'import polars as p; {code}')}")
+        print(visible(f"  python -c {in_quotes(f'import polars as p; {code}')}"))
     command = [f"evofsm learn {' '.join(map(quote, files))}"]
     command += (f"{name} {in_quotes(value)}" for name, value in options)
-    print("  " + " \\\n      ".join(command), flush=True)
+    print("  " + " \\\n      ".join(map(visible, command)), flush=True)
 
 
 def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:

@@ -7,7 +7,7 @@ import json
 import math
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from enum import Enum
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
@@ -42,8 +42,9 @@ def say(text: object) -> None:
 
 
 def warn(text: object) -> None:
-    """Print a line on standard error."""
-    print(f"evofsm: {visible(str(text))}", file=sys.stderr, flush=True)
+    """Print a line on standard error; where that cannot be, as on a full disk, all else goes on."""
+    with suppress(OSError, ValueError):
+        print(f"evofsm: {visible(str(text))}", file=sys.stderr, flush=True)
 
 
 def facts(title: str, pairs: Iterable[tuple[str, str]]) -> RenderableType:

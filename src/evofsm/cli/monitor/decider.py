@@ -30,6 +30,7 @@ from evofsm.driving.traffic import COLUMNS, RATES, TrafficRisk, lies_across
 from evofsm.fsm import EvolvingFSM
 from evofsm.fsm.validation import probability
 from evofsm.guard import ActionReviser, BoxActions, Choices, Foresight, Guard, LearntRisk, Mode
+from evofsm.guard.actions import limits
 from evofsm.guard.api import Proposal, Revision
 from evofsm.guard.audit_log import AuditLog
 from evofsm.guard.foresight import DATES, span
@@ -89,12 +90,13 @@ class Decider:
 
     def warm(self) -> None:
         """Compile what decides, by a few decisions of a copy, which then is thrown away."""
-        twin, observation = self.guard.copy(), np.ones(self.form.count or 1)
+        twin, most = self.guard.copy(), limits(self.guard.actions)[1]
+        observation = np.resize([1.0, 20.0, 0.0], self.form.count or 1)  # a car is refused there
         if self.form.scenes:
             ego, car = Object("", 0.0, 0.0, 20.0), Object("", 30.0, 0.0, 10.0)
             observation = Scene(ego, [car, car._replace(x=-20.0)]).rows(2)
         for k in range(4):
-            twin.decide(observation + 0.1 * k * (not self.form.scenes), None)
+            twin.decide(observation + 0.1 * k * (not self.form.scenes), most)
         twin.end(observation=observation)
 
     def answer(self, line: bytes, csv: CsvRows | None = None, *, is_cut: bool = False) -> Answer:
