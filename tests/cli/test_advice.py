@@ -198,6 +198,16 @@ def test_a_first_look_takes_no_good_ending_for_a_failure_and_observes_no_outcome
     assert "12 episodes ended with terminated==1" in evofsm(*shlex.split(command)).stdout
 
 
+def test_a_first_look_observes_what_is_infinite_where_nobody_is_near(evofsm, refused):
+    rows = (f"{k // 10},{k % 10},{'inf' if k % 60 < 30 else 6 - k % 60 / 10}" for k in range(600))
+    Path("scan.csv").write_text("\n".join(["sec,nanosec,front", *rows]))
+    looked = evofsm("learn", "scan.csv")
+    assert looked.stderr == ""
+    assert re.search(r"--observe \S*front", looked.stdout)
+    asked = "learn", "scan.csv", "--observe", "front", "--action", "", "--time", "sec,nanosec"
+    assert "sec and nanosec are no date and time of day" in refused(*asked)
+
+
 @pytest.mark.parametrize(
     ("field", "live"), [(" Fault ", "Fault"), ('"too hot\ntrip"', "too hot\ntrip"), ("TRUE", True)]
 )

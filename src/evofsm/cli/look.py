@@ -110,7 +110,8 @@ def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:
     for name, z in ((name, frame[name].to_numpy()) for name in numbers):
         if np.isfinite(z).any():
             for_none, z = are_stand_ins(z), z * tables.UNITS.get(units[name], 1.0)
-            values[name], stand_ins[name] = np.where(for_none, np.nan, z), np.unique(z[for_none])
+            stand_ins[name] = np.unique(z[for_none])
+            values[name] = np.where(for_none | np.isinf(z), np.nan, z)
     texts = [name for name in frame.columns if frame[name].dtype == polars.String]
     runs, still = np.ones(len(frame), np.bool_), next((n for n in values if _stands(values[n])), "")
     limit = _round(0.1 * float(np.nanquantile(np.abs(values[still]), 0.95))) if still else 0.0
@@ -303,7 +304,7 @@ def _clock_of(frame: polars.DataFrame, names: Sequence[str]) -> tuple[str, str, 
     """The column of numbers that is a clock, by values or name; its unit, and since when."""
     epochs = dict[str, str]()
     for name in names:
-        z = frame[name].drop_nans().to_numpy()
+        z = frame[name].filter(frame[name].is_finite()).to_numpy()
         low, high, steps = (z.min(), z.max(), np.diff(z)) if len(z) else (0.0, 0.0, z)
         if low < high and ((steps >= 0).all() or np.median(np.abs(steps)) < 0.1 * (high - low)):
             fit = [unit for unit, n in _EPOCHS.items() if 9e8 * n < low < high < 2.6e9 * n]

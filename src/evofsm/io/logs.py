@@ -915,6 +915,10 @@ class _Reader:
         form = columns.units.get(columns.time, "")
         form = form if "%" in form else ""
         is_dated = clock and (form or tables.is_date(" ".join(map(table.first, clock))))
+        if len(clock) > 1 and not is_dated:
+            fault = f"{' and '.join(clock)} are no date and time of day (--time)"
+            hint = "of seconds and nanoseconds make one column, as polars adds them"
+            raise ValueError(f"{table.path}: {fault}; {hint}")
         numbers = [*self._observed, columns.action, *(t.column for t in self._terms if t.of_number)]
         numbers = [*dict.fromkeys([*numbers, *([] if is_dated else clock)])]
         usual = columns.usual_units if isinstance(table, CsvTable) else {}
