@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from evofsm.cli.learning import range_of, unit_in
 from evofsm.cli.options import in_quotes, quoted, seconds
-from evofsm.cli.show import facts, show
-from evofsm.fsm.naming import visible
+from evofsm.cli.show import facts, say, show
 from evofsm.guard.foresight import span
 from evofsm.io import tables
 from evofsm.io.logs import SKIPPED, USUAL_EPISODE, are_stand_ins, are_unusual, hours_unsaid
@@ -83,7 +82,7 @@ def show_look(files: Sequence[str], table: CsvTable | ParquetTable) -> None:
         raise ValueError(f"{file} has no {kind} of numbers that change{why}")
     to_file = "--guard" if any(name == "--failed" for name, _ in options) else "--out"
     options += [(to_file, f"{to_file[2:]}.evofsm")] if options else []
-    print("\nA way to learn from it:")
+    say("\nA way to learn from it:")
     if before and len(files) == 1:
         kind = "csv" if isinstance(table, CsvTable) else "parquet"
         mark, how = f", separator={table.separator!r}" * (kind == "csv"), ", infer_schema=False"
@@ -91,10 +90,10 @@ def show_look(files: Sequence[str], table: CsvTable | ParquetTable) -> None:
         files = [f"{Path(file).name.partition('.')[0]}-{suffix}.{kind}"]
         read = f"p.read_{kind}({file!r}{mark}{how * bool(mark)})"
         code = f"{read}{before}.write_{kind}({files[0]!r}{mark})"
-        print(visible(f"  python -c {in_quotes(f'import polars as p; {code}')}"))
+        say(f"  python -c {in_quotes(f'import polars as p; {code}')}")
     command = [f"evofsm learn {' '.join(map(quote, files))}"]
     command += (f"{name} {in_quotes(value)}" for name, value in options)
-    print("  " + " \\\n      ".join(map(visible, command)), flush=True)
+    say("  " + " \\\n      ".join(command))
 
 
 def look_at(table: CsvTable | ParquetTable) -> tuple[Pairs, Pairs, str]:

@@ -41,9 +41,9 @@ _PLAIN: Mapping[str, Any] = {"has_header": False, "ignore_errors": True, "raise_
 _BYTE_ORDER_MARK, _GZIP, _PARQUET = b"\xef\xbb\xbf", b"\x1f\x8b", b"PAR1"
 _SQLITE, _MCAP = b"SQLite format 3\0", b"\x89MCAP0\r\n"
 _CONTROL = re.compile(rb"[\0-\x08\x0e-\x1f]")  # what no text holds
-# How files begin that others hand around and we do not read: what they are, and the way out. A
-# column may be called as a mark of letters alone; binary data goes on behind that.
+# A column may be called as a mark of letters alone; binary data goes on behind that.
 _BINARY = rb"(?s:.*" + _CONTROL.pattern + rb")"
+# How files begin that others hand around and we do not read: what they are, and the way out.
 _FOREIGN = {
     rb"\xfd7zXZ\0": "is compressed by xz; unpack it: xz --decompress --keep FILE",
     rb"\x5d\0\0": "is compressed by lzma; unpack it: xz --format=lzma --decompress --keep FILE",
